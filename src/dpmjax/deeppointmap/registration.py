@@ -125,10 +125,8 @@ def register(
 def _register_as_room(
     model: Model, source: ScanOrCloud, target: ScanOrCloud, found: Registration, *, refine: bool | None
 ) -> Registration:
-    """Registers scans of small rooms enlarged, too, because the network has learned streets and halls.
-
-    The motion is kept under which the surfaces meet more closely. The enlarged scans are of no calibrated size.
-    """
+    """Registers scans of small rooms enlarged, too: the motion is kept under which the surfaces meet more closely."""
+    # The network has learned streets and halls, and the confidence is calibrated on these.
     points = [valid_points(cast(RawScan, read_path(scan, "io.read_lidar_file"))) for scan in (source, target)]
     if not all(len(some) and np.median(np.linalg.norm(some, axis=1)) < ROOM_M for some in points):
         return found
