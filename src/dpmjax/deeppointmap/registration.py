@@ -45,7 +45,7 @@ from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
 from dpmjax.scans.pair_registration import PairEvidence, ScanRegistration
 from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.sizes import matched_share, relative_size
-from dpmjax.scans.weak_directions import WeakDirection, plane_information, weakest_direction
+from dpmjax.scans.weak_directions import WeakDirection, corridor_axis, plane_information, weakest_direction
 from dpmjax.types import DescriptorCloud, Pose, Poses, RawScan, Registration, Verification
 
 # Probability from which one way is enough: of 517 such motions of real pairs two were wrong.
@@ -130,9 +130,12 @@ def _register_as_room(
     points = [valid_points(cast(RawScan, read_path(scan, "io.read_lidar_file"))) for scan in (source, target)]
     if not all(len(some) and np.median(np.linalg.norm(some, axis=1)) < ROOM_M for some in points):
         return found
+    one, two = (measure_scan(FINE_SCALE * some).surface for some in points)
+    # Surfaces of a corridor meet after any shift along it.
+    if any(corridor_axis(surface) is not None for surface in (one, two)):
+        return found
     other = _register_either_way(model, [(ROOM_SCALE * points[0], ROOM_SCALE * points[1])], refine=refine)[0]
     T_other = other.T_target_source.at[:3, 3].divide(ROOM_SCALE)
-    one, two = (measure_scan(FINE_SCALE * some).surface for some in points)
 
     def agreement(T_target_source: Array) -> float:
         T = np.array(T_target_source, np.float64)
