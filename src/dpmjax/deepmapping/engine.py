@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import as_key
 from dpmjax.deepmapping.problem import Problem
+from dpmjax.geometry.traced import typed_jit
 from dpmjax.kept_programs import kept_jit, prepare_program
 from dpmjax.types import with_short_repr
 
@@ -148,7 +149,7 @@ def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = No
     return _advance(problem, phase, state, data)
 
 
-@partial(jax.jit, static_argnums=0, static_argnames="phase")
+@typed_jit("problem", "phase")
 def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> FitState:
     """Makes the state at the start of a phase from the state at the end of the phase before.
 
@@ -167,7 +168,7 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
     return replace(state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=zero)
 
 
-@partial(jax.jit, static_argnums=0)
+@typed_jit("problem")
 def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Report]:
     """Runs all phases from a fresh state as one pure function.
 

@@ -23,6 +23,7 @@ from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.bearing import directions_of, turned_directions
 from dpmjax.geometry.consensus import INLIER_M, ConsensusConfig, find_consensus, motion_support
 from dpmjax.geometry.rigid import safe_sqrt
+from dpmjax.geometry.traced import typed_jit
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
 # Pairs with longer offsets are dropped.
@@ -277,7 +278,7 @@ def _solve(pairs: _PointPairs, is_inlier: Bool[Array, " p"]) -> tuple[Float[Arra
     return T_target_source, safe_sqrt(squared)
 
 
-@jax.jit
+@typed_jit()
 def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"]) -> DescriptorCloud:
     """Merges several descriptor clouds into one frame: a map, without new extraction (DeepPointMap section 3.1).
 

@@ -21,6 +21,7 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid import build_pyramid_on_host
+from dpmjax.geometry.traced import typed_jit
 from dpmjax.kept_programs import kept_jit
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
@@ -161,7 +162,7 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
     return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)
 
 
-@jax.jit
+@typed_jit()
 def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
     """Correlates two descriptor clouds by attention (DeepPointMap section 3.2, figure 2b).
 

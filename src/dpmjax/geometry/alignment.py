@@ -19,14 +19,14 @@ from jaxtyping import Array, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.geometry.rigid import matmul, namespace_of
-from dpmjax.geometry.traced import is_usable, usable_weights
+from dpmjax.geometry.traced import is_usable, typed_jit, usable_weights
 from dpmjax.types import AnyArray
 
 # Largest singular value that counts as zero, relative to the largest one, in epsilons of the dtype.
 DEGENERATE_IN_EPS = 32
 
 
-@jax.jit
+@typed_jit()
 def weighted_svd(
     source: Float[AnyArray, "n d"], target: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "d1 d1"]:

@@ -9,7 +9,6 @@ it. Proposals are ranked by their support, and of near-equal ones only the best 
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import flax.struct
@@ -21,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_fields, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import motions_of_weights
-from dpmjax.geometry.traced import is_usable
+from dpmjax.geometry.traced import is_usable, typed_jit
 from dpmjax.types import AnyArray
 
 # Two pairs agree if the distances between their points differ by less than this on the two sides, metres. Points nearer
@@ -70,7 +69,7 @@ class Consensus:
     support: Float[Array, "*b h"]
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@typed_jit("config")
 def find_consensus(
     source: Float[AnyArray, "k 3"],
     target: Float[AnyArray, "k 3"],

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -14,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from dpmjax.checks import as_mask, as_points, require_count, require_value
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.planes import fit_planes
-from dpmjax.geometry.traced import is_usable
+from dpmjax.geometry.traced import is_usable, typed_jit
 from dpmjax.types import AnyArray, Neighbours, PointPyramid, SurfaceElements, with_short_repr
 
 # Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
@@ -60,7 +58,7 @@ def image_normals(
     return np.where(is_surface[..., None], normals / length[..., None], 0), is_surface
 
 
-@functools.partial(jax.jit, static_argnames="k")
+@typed_jit("k")
 def estimate_normals(points: Float[AnyArray, "n d"], k: int, mask: Bool[AnyArray, " n"] | None = None) -> Normals:
     """The direction in which the k nearest points (the point itself among them) spread least.
 

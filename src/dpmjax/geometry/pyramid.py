@@ -7,7 +7,6 @@ which is a function of its parameters and of this. `build_pyramid` is for one cl
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import fpsample
@@ -19,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive, require_value
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
-from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable
+from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable, typed_jit
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
 # Relative slack of the radius: quantised points often lie exactly on it, and rounding must not decide.
@@ -81,7 +80,7 @@ class PyramidConfig:
         require_value(is_falling, "stages", "no stage to have more points than the one before", counts)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@typed_jit("config")
 def build_pyramid(
     points: Float[AnyArray, "n 3"], mask: Bool[AnyArray, " n"] | None, config: PyramidConfig
 ) -> PointPyramid:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +9,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
-from dpmjax.geometry.traced import is_usable, with_axes_of
+from dpmjax.geometry.traced import is_usable, typed_jit, with_axes_of
 from dpmjax.types import AnyArray
 
 
-@partial(jax.jit, static_argnames="num_samples")
+@typed_jit("num_samples")
 def farthest_point_sample(
     points: Float[AnyArray, "n d"], num_samples: int, mask: Bool[AnyArray, " n"] | None = None
 ) -> Int[Array, " s"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,26 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.types import AnyArray
 
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+
 # Sums of ten million squares of such numbers stay below the largest float32, 3.4e38.
 LARGEST_COORDINATE = 1e15
+
+
+def typed_jit(*static_argnames: str) -> Callable[[Kernel], Kernel]:
+    """Compiles a kernel as `jax.jit` does; type checkers know its arguments and its result.
+
+    Args:
+        *static_argnames: names of the static arguments.
+
+    Returns:
+        The decorator.
+    """
+
+    def compile_kernel(kernel: Kernel) -> Kernel:
+        return cast(Kernel, jax.jit(kernel, static_argnames=static_argnames))
+
+    return compile_kernel
 
 
 def is_usable(points: Float[AnyArray, "*n d"]) -> Bool[Array, "*n"]:

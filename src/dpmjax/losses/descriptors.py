@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_shape
 from dpmjax.geometry.rigid import safe_sqrt
+from dpmjax.geometry.traced import typed_jit
 from dpmjax.types import AnyArray
 
 # Largest determinant of a covariance that is not invertible, in epsilons of that of a ball of the same size.
@@ -100,7 +101,7 @@ def _unit(vectors: Float[Array, "n c"]) -> Float[Array, "n c"]:
     return jnp.where(is_zero, 0, scaled / length)
 
 
-@jax.jit
+@typed_jit()
 def offset_loss(
     predicted: Float[AnyArray, "n d"], true: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
 ) -> Float[Array, ""]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_value
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.rigid import safe_sqrt
-from dpmjax.geometry.traced import usable_weights
+from dpmjax.geometry.traced import typed_jit, usable_weights
 from dpmjax.types import AnyArray
 
 
@@ -67,7 +67,7 @@ def _mean_distance(
     return jnp.sum(jnp.minimum(safe_sqrt(squared), limit)) / jnp.maximum(jnp.sum(is_counted), 1)
 
 
-@jax.jit
+@typed_jit()
 def occupancy_loss(
     logits: Float[AnyArray, "..."], labels: Float[AnyArray, "..."], weights: Float[AnyArray, "..."]
 ) -> Float[Array, ""]:

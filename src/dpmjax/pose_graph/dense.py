@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, require_count
-from dpmjax.geometry.traced import solution_tangent, with_axes_of
+from dpmjax.geometry.traced import solution_tangent, typed_jit, with_axes_of
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray
@@ -41,7 +41,7 @@ class DenseSolution(NamedTuple):
     converged: Bool[Array, ""]
 
 
-@partial(jax.jit, static_argnames="num_steps")
+@typed_jit("num_steps")
 def solve_dense(
     poses: Float[AnyArray, "n *s"],
     edges: Edges,

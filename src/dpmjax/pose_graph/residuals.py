@@ -19,11 +19,12 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, require_shape
 from dpmjax.geometry import rigid, se2, se3
+from dpmjax.geometry.traced import typed_jit
 from dpmjax.pose_graph.graph import TANGENT_SIZE, Edges
 from dpmjax.types import AnyArray
 
 
-@jax.jit
+@typed_jit()
 def residuals(
     poses: Float[AnyArray, "n *s"], edges: Edges, edge_mask: Bool[AnyArray, " e"] | None = None
 ) -> Float[Array, "e d"]:
