@@ -64,9 +64,9 @@ def icp(
 
     The gradient is that of the solution, by the implicit function theorem (Blondel et al. 2022, section 2.1). The
     weighted residuals balance at the solution, also after the points have moved a little. Pairs and normals are
-    constants of the derivative. The gradient is zero along unconstrained directions and with respect to `T_init`. It holds
-    locally: it jumps where pairs change, with "plane" more than with "point"; compare finite differences of several
-    lengths.
+    constants of the derivative. The gradient is zero along unconstrained directions and with respect to `T_init`. It
+    holds locally: it jumps where pairs change, with "plane" more than with "point". Compare it with finite differences
+    of several lengths.
 
     Args:
         source: points.
