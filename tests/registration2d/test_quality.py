@@ -7,8 +7,8 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import assess_trajectory, choose_trajectory, planar_scans, quality
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.quality import map_code_length, view_misfit
-from dpmjax.registration2d.steps import StepPrior
 from dpmjax.simulation import scan_world, simulate_sequence
 
 

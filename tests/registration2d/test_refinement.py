@@ -11,7 +11,7 @@ from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d import correct_by_loops, loop_closure, planar_scans, refine, refinement
 from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import count_support, find_candidates
-from dpmjax.registration2d.steps import StepPrior
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 from tests.registration2d.conftest import ate

@@ -11,11 +11,11 @@ from dpmjax.geometry import se2
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
+from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.planar_scans import PlanarScans
 from dpmjax.registration2d.range_profiles import weak_steps
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_search import align_arcs
-from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.simulation import make_world, scan_world, simulate_sequence
 
 NUM_SCANS, METRES_A_PX = 24, 0.05

@@ -14,9 +14,10 @@ from dpmjax.registration2d import (
     refine,
 )
 from dpmjax.registration2d.joint_alignment import restore_torn
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.refinement import put_back_slid
-from dpmjax.registration2d.steps import StepPrior, slide_steps
+from dpmjax.registration2d.steps import slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.

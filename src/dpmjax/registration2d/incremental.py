@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
+from dpmjax.registration2d.motion_prior import StepPrior, usual_motion
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, fan, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
-from dpmjax.registration2d.steps import StepPrior, usual_motion
 
 # Residuals as shares of the typical range: of a coarse match, and along a direction that the scans leave unconstrained.
 _COARSE_RESIDUAL = 0.015

@@ -18,10 +18,11 @@ import scipy.spatial
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_rows, take_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.pair_alignment import Schedule, linearise_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
-from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
+from dpmjax.registration2d.steps import Slides, held_steps, pose_steps, prior_steps, slide_steps
 
 # Gates and kernels of the rounds, and number of rounds after which the neighbours are chosen anew.
 _ROUNDS, _REFRESH = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14), 4

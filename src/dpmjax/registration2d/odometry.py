@@ -14,9 +14,10 @@ import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import match_near
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
-from dpmjax.registration2d.steps import StepPrior, slide_steps
+from dpmjax.registration2d.steps import slide_steps
 
 # Score above which a step is clear.
 _CLEAR_SCORE = 0.45

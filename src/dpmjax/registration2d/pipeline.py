@@ -23,12 +23,12 @@ from dpmjax.deepmapping.sensors import as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.registration2d.global_registration import nearest_tour, register_globally
 from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
 from dpmjax.registration2d.recordings import Recording, choose_scans, find_silent_steps, interpolate, take_scans
 from dpmjax.registration2d.refinement import put_back_slid, refine
-from dpmjax.registration2d.steps import StepPrior
 from dpmjax.types import ScanSet, with_short_repr
 
 StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]

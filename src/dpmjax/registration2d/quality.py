@@ -24,10 +24,11 @@ from jaxtyping import Bool
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import label_parts
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.pair_search import Hypotheses
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs, pair_scores
-from dpmjax.registration2d.steps import Slides, StepPrior, slid_steps, slide_steps
+from dpmjax.registration2d.steps import Slides, slid_steps, slide_steps
 
 # Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
 # walls in the cells changes the code length by some percent.

@@ -18,12 +18,13 @@ from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_slid, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.registration2d.loop_closure import correct_by_loops
+from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
-from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps, slid_steps
+from dpmjax.registration2d.steps import matched_steps, settle_steps, slid_steps
 from dpmjax.types import ScanSet, with_short_repr
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,

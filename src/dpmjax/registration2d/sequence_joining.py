@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
+from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans, spread_evenly
 from dpmjax.registration2d.range_profiles import pair_scores, weak_steps
-from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end

@@ -16,6 +16,7 @@ import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import join_rows
+from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
@@ -29,7 +30,6 @@ from dpmjax.registration2d.range_profiles import (
 )
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_joining import join_parts
-from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.scans.apart import apart
 
 # Turns of a step that are searched, radians for each scan that it spans.
