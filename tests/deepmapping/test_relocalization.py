@@ -11,9 +11,10 @@ import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import relocalization
 from dpmjax.deepmapping.engine import init
+from dpmjax.deepmapping.map_rendering import make_raster, render_scans
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
-from dpmjax.deepmapping.relocalization import make_raster, propose_poses, render_scans
+from dpmjax.deepmapping.relocalization import propose_poses
 from dpmjax.geometry import se2
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
