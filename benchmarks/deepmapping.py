@@ -18,8 +18,9 @@ from dpmjax import ScanSet, fit_deepmapping
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration2d import incremental_icp, planar_scans, refine
+from dpmjax.scan import planar_scans
 from dpmjax.simulation import simulate_sequence
+from dpmjax.slam import incremental_icp, refine
 
 RECORDED = DATA / "deepmapping_2d" / "v1_pose0.tar"
 _MARKS_S = (15.0, 30.0, 60.0, 120.0, 180.0)

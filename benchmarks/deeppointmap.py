@@ -21,7 +21,7 @@ from benchmarks import DATA, Row, in_new_process, measure
 from dpmjax import deeppointmap as dpm
 from dpmjax.cli import peak_rss_gb
 from dpmjax.io import LidarSequence, open_lidar_sequence
-from dpmjax.scans import preprocess_scan_on_host
+from dpmjax.scan import preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
 
 Scans = dict[str, np.ndarray]

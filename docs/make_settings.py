@@ -40,7 +40,7 @@ class Group(NamedTuple):
 
 
 SCANS_2D = Group("2-D scans", (
-    Section("RegistrationConfig", "dpmjax.registration2d", "`register_scans(scans, config, key=key)`", {
+    Section("RegistrationConfig", "dpmjax.slam", "`register_scans(scans, config, key=key)`", {
         "is_ordered": ("", "False for scans without an order in time; the start is then the global search"),
         "refine": ("", "False: no candidate is refined"),
         "min_distance": ("unit of the scans", "0.5 m for whole recordings: nearer scans follow the odometry"),
@@ -66,7 +66,7 @@ SCANS_2D = Group("2-D scans", (
 ))  # fmt: skip
 
 SCANS_3D = Group("3-D scans", (
-    Section("PreprocessConfig", "dpmjax.scans", "`ModelConfig.preprocess`; a trained model keeps its own", {
+    Section("PreprocessConfig", "dpmjax.scan", "`ModelConfig.preprocess`; a trained model keeps its own", {
         "min_range_m": ("m", "higher if the vehicle itself is seen"),
         "max_range_m": ("m", "shorter indoors"),
         "voxel_size_m": ("m", "smaller for rooms; the network must be trained with it"),

@@ -13,10 +13,11 @@ from typing import Literal
 import jax
 import numpy as np
 
-from dpmjax import ScanSet, registration2d
+from dpmjax import ScanSet, scan, slam
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence
-from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
+from dpmjax.scan import PlanarScans
+from dpmjax.slam import DEEPMAPPING, START_NAMES
 from experiments._baselines import chain_icp, multiway, optimize_directly, swarm_poses
 
 Candidates = dict[str, np.ndarray]
@@ -59,23 +60,23 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | N
     if not is_ordered:
         order = np.random.default_rng([seed, 77]).permutation(len(sequence))
         sequence = replace(sequence.take(order), odometry_poses=None)
-    planar = registration2d.planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
+    planar = scan.planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
     return Task(sequence, planar, is_ordered, steps, seed)
 
 
 def align_incrementally(task: Task, metric: Literal["point", "plane"] = "plane") -> np.ndarray:
     """Returns poses by incremental ICP."""
-    return registration2d.incremental_icp(task.planar, metric).poses
+    return slam.incremental_icp(task.planar, metric).poses
 
 
 def search(task: Task) -> np.ndarray:
     """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
-    return registration2d.register_globally(task.planar)
+    return slam.register_globally(task.planar)
 
 
 def refine(task: Task, poses: np.ndarray) -> np.ndarray:
     """Returns the poses after the alignment of all scans together."""
-    return registration2d.refine(task.planar, poses).poses
+    return slam.refine(task.planar, poses).poses
 
 
 def fit(task: Task, start: np.ndarray | None, config: dm.DeepMappingConfig | None = None) -> np.ndarray:
@@ -83,7 +84,7 @@ def fit(task: Task, start: np.ndarray | None, config: dm.DeepMappingConfig | Non
     settings = config or dm.preset("fast")
     settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
     ordered = task.is_ordered
-    return registration2d.fit_in_order(task.scans, settings, key=task.key, start=start, is_ordered=ordered).poses
+    return slam.fit_in_order(task.scans, settings, key=task.key, start=start, is_ordered=ordered).poses
 
 
 def optimize_by_lbfgs(task: Task) -> np.ndarray:
@@ -130,11 +131,11 @@ def fit_from_refined(task: Task) -> Candidates:
     ICP is taken if it can be trusted, else of both the one of the stronger weakest connection. Between two different
     maps the sharper one may be wrong, so the code length does not decide here.
     """
-    starts: list[tuple[registration2d.Assessment, str, np.ndarray]] = []
+    starts: list[tuple[slam.Assessment, str, np.ndarray]] = []
     for name, find in (("icp-plane", align_incrementally), ("global", search)):
         if (name == "global" or task.is_ordered) and not (starts and starts[0][0].is_trusted):
             poses = refine(task, find(task))
-            assessment = registration2d.assess_trajectory(task.planar, poses)
+            assessment = slam.assess_trajectory(task.planar, poses)
             starts.append((assessment, f"{START_NAMES[name]}, refined", poses))
     _, name, start = max(starts, key=lambda one: one[0].weakest_connection)
     fitted = fit(task, start)

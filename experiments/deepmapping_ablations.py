@@ -24,7 +24,7 @@ from tyro.conf import arg
 
 from dpmjax import cli, nets, simulation
 from dpmjax import deepmapping as dm
-from dpmjax.registration_rgbd import as_depth_scans
+from dpmjax.scan import as_depth_scans
 from experiments.deepmapping_rgbd import errors_of
 
 # Images of a walk, and pixels of each in a step.

@@ -21,7 +21,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, metrics
-from dpmjax.registration2d import DEEPMAPPING, START_NAMES
+from dpmjax.slam import DEEPMAPPING, START_NAMES
 
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
 RIGHT_M = 0.5

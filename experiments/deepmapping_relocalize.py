@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from tyro.conf import arg
 
-from dpmjax import ScanSet, cli, metrics, registration2d, simulation
+from dpmjax import ScanSet, cli, metrics, scan, simulation, slam
 from dpmjax import deepmapping as dm
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
@@ -57,9 +57,7 @@ def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
     grid, key = simulation.make_world(options.world).is_obstacle, jax.random.key(options.seed)
     scans, start = ScanSet(sequence.points, sequence.mask), None
     if options.init == "icp-plane":
-        start = registration2d.incremental_icp(
-            registration2d.planar_scans(sequence.points, sequence.mask), "plane"
-        ).poses
+        start = slam.incremental_icp(scan.planar_scans(sequence.points, sequence.mask), "plane").poses
     fitted = dm.fit_deepmapping(scans, dm.preset(options.preset), key=key, start=start)
     begun = time.perf_counter()
     trained = jax.block_until_ready(dm.train_localization(fitted, scans, num_steps=NUM_STEPS, key=key))

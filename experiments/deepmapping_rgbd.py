@@ -31,7 +31,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, metrics, simulation
 from dpmjax import deepmapping as dm
-from dpmjax import registration_rgbd as rgbd
+from dpmjax.scan import DepthScans, as_depth_scans, initialize_depth
 from experiments._baselines import multiway_images
 
 SUCCESS_M = 0.45
@@ -42,7 +42,7 @@ NUM_APARTMENTS, FIRST_HARD = 15, 1000
 WINDOW, WINDOW_STEP = 8, 4
 ICP_POINTS = 800
 
-Scans = rgbd.DepthScans
+Scans = DepthScans
 Register = Callable[[Scans, dm.DeepMappingConfig, jax.Array], np.ndarray]
 
 
@@ -77,7 +77,7 @@ def main(options: RgbdOptions, run: cli.Run) -> cli.Row:
 
     def work(walk: int, method: str) -> cli.Row:
         sequence, begun = read(walk), time.perf_counter()
-        scans = rgbd.as_depth_scans(sequence.points, sequence.mask)
+        scans = as_depth_scans(sequence.points, sequence.mask)
         T = METHODS[method](scans, settings, jax.random.key(options.seed))
         seconds = time.perf_counter() - begun
         return {"sequence": sequence.name, "views": len(sequence), **errors_of(T, sequence), "seconds": seconds}
@@ -122,7 +122,7 @@ def errors_of(T: np.ndarray, sequence: io.DepthSequence) -> cli.Row:
 
 def chain_icp(scans: Scans, settings: dm.DeepMappingConfig, key: jax.Array) -> np.ndarray:
     """Returns poses by point-to-plane ICP of each image onto the one before, from the same pose."""
-    from dpmjax.registration2d import icp
+    from dpmjax.scan import icp
 
     rng = np.random.default_rng(jax.random.key_data(key)[-1].item())
     # One size for all clouds, so that ICP compiles once.
@@ -139,7 +139,7 @@ def chain_icp(scans: Scans, settings: dm.DeepMappingConfig, key: jax.Array) -> n
 # zero. "direct": its losses without L-Net, from L-Net's first forward pass, as in the paper.
 METHODS: dict[str, Register] = {
     "zero": lambda scans, settings, key: np.tile(np.eye(4), (len(scans.points), 1, 1)),
-    "placed": lambda scans, settings, key: rgbd.initialize_depth(scans, settings.motion, key=key).T_world_camera,
+    "placed": lambda scans, settings, key: initialize_depth(scans, settings.motion, key=key).T_world_camera,
     "deepmapping": lambda scans, settings, key: dm.register_depth(scans, settings, key=key).T_world_scan,
     "deepmapping-cold": lambda scans, settings, key: dm.fit_deepmapping(scans, settings, key=key).T_world_scan,
     "direct": lambda scans, settings, key: dm.fit_deepmapping(scans, dm.as_direct(settings), key=key).T_world_scan,

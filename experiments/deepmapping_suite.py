@@ -20,7 +20,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import cli, metrics, registration2d, simulation
+from dpmjax import cli, metrics, simulation, slam
 from experiments._deepmapping_methods import METHODS, PACKAGES, Task, make_task
 
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
@@ -100,12 +100,12 @@ def run_method(name: str, task: Task) -> cli.Row:
     # The choice belongs to a method that has several candidates, and to its time.
     kept = next(iter(candidates))
     if len(candidates) > 1:
-        kept, _ = registration2d.choose_trajectory(task.planar, candidates)
+        kept, _ = slam.choose_trajectory(task.planar, candidates)
     seconds = {"seconds": time.perf_counter() - begun, "cpu_s": time.process_time() - begun_cpu}
     errors = {other: metrics.planar_errors(task.sequence, poses) for other, poses in candidates.items()}
     ates = {other: numbers["ate_px"] for other, numbers in errors.items()}
     success = ates[kept] < SUCCESS_PX
-    is_trusted = registration2d.assess_trajectory(task.planar, candidates[kept]).is_trusted
+    is_trusted = slam.assess_trajectory(task.planar, candidates[kept]).is_trusted
     return {
         **errors[kept],
         "success": success,

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model, metrics, save_model, scans, simulation, viz
+from dpmjax import cli, load_model, metrics, save_model, scan, simulation, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
@@ -201,8 +201,8 @@ def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> c
     evidence = [np.load(run / f"scene_{number}.npz") for number in range(len(cases))]
     shares, is_right = (np.concatenate([one[name] for one in evidence]) for name in ("shares", "is_right"))
     weights, bias = dpm.fit_weights(shares, is_right)
-    fitted = dpm.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist())
-    compared = {"present": dpm.EvidenceWeights(), "fitted": fitted}
+    fitted = scan.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist())
+    compared = {"present": scan.EvidenceWeights(), "fitted": fitted}
     rights = {f"right_by_{name}": share_right(evidence, np.array(astuple(one)[1:])) for name, one in compared.items()}
     return {"evidence": asdict(fitted), **rights, "verdict": str(fitted)}
 
@@ -226,20 +226,20 @@ def measure_motions(
         rng, T_lidar_turned = np.random.default_rng([seed, row]), np.eye(4)
         tilt = Rotation.from_euler("xy", rng.normal(0, TILT_DEG, 2), degrees=True)
         T_lidar_turned[:3, :3] = (tilt * Rotation.from_euler("z", rng.uniform(0, 360), degrees=True)).as_matrix()
-        scan = drive.read_scan(int(row)) @ T_lidar_turned[:3, :3]
+        points = drive.read_scan(int(row)) @ T_lidar_turned[:3, :3]
         if thinned:
-            scan = scan[np.linalg.norm(scan, axis=1) < THINNED_RANGE_M]
-            scan = scan[rng.choice(len(scan), min(NUM_THINNED, len(scan)), replace=False)]
-        clouds.append(scan.astype(np.float32))
+            points = points[np.linalg.norm(points, axis=1) < THINNED_RANGE_M]
+            points = points[rng.choice(len(points), min(NUM_THINNED, len(points)), replace=False)]
+        clouds.append(points.astype(np.float32))
         poses.append(drive.T_world_lidar[row] @ T_lidar_turned)
-    prepared = [dpm.prepare_scan(model, scan) for scan in clouds]
-    found = dpm.match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
-    surfaces, config = [scan.surface for scan in prepared], model.config.verification
-    T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
-    for alignment in (dpm.COARSE, dpm.FINE):
-        T = scans.align_on_host(*surfaces, T, alignment).T_target_source
+    prepared = [dpm.prepare_scan(model, points) for points in clouds]
+    found = dpm.match_clouds(model, *(side.descriptors for side in prepared), config=model.config.matching)
+    surfaces, config = [side.surface for side in prepared], model.config.verification
+    T = np.concatenate([dpm.distinct_motions(found), scan.correlate_views(*surfaces, config.views)])
+    for alignment in (scan.COARSE, scan.FINE):
+        T = scan.align_on_host(*surfaces, T, alignment).T_target_source
     T_true = np.broadcast_to(rigid.inverse(poses[1]) @ poses[0], T.shape)
-    return dpm.evidence_shares(*prepared, T, config), metrics.registration_recall(T, T_true).is_right
+    return scan.evidence_shares(*prepared, T, config), metrics.registration_recall(T, T_true).is_right
 
 
 def share_right(scenes: Sequence[Mapping[str, np.ndarray]], weights: np.ndarray) -> float:

@@ -30,7 +30,7 @@ from tyro.conf import arg
 from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
-from dpmjax.scans import measure_scan
+from dpmjax.scan import VerificationConfig, measure_scan
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
@@ -88,7 +88,7 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return T
 
 
-def search_alone(source: np.ndarray, target: np.ndarray, config: dpm.VerificationConfig) -> np.ndarray:
+def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
     """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
     measured = measure_scan(source, config.surface), measure_scan(target, config.surface)
     chosen = dpm.choose_motion(*measured, np.eye(4)[None], config)

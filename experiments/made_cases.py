@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tyro.conf import arg
 
-from dpmjax import cli, deepmapping, deeppointmap, io, metrics, registration2d, sequences, simulation, slam, weights
+from dpmjax import cli, deepmapping, deeppointmap, io, metrics, sequences, simulation, slam, weights
 from dpmjax.geometry import rigid, se2
 
 NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M, RIGHT_PASSAGE_M = 25, 0.12, 0.006, 0.9, 0.05, 0.5
@@ -155,9 +155,9 @@ def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
         begin = int(rng.integers(1, len(steps) - count))
         steps[begin : begin + count] = 0.0
     points = (ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).astype(np.float32)
-    found = registration2d.register_scans(
+    found = slam.register_scans(
         points,
-        registration2d.RegistrationConfig(fit=FEW_STEPS, min_distance=0.1),
+        slam.RegistrationConfig(fit=FEW_STEPS, min_distance=0.1),
         key=jax.random.key(0),
         odometry=None if odometry == "none" else se2.chain(steps),
     )

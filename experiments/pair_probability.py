@@ -23,7 +23,7 @@ import dpmjax
 from dpmjax import cli, io, metrics, simulation
 from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid, se2, se3
-from dpmjax.scans import PairEvidence
+from dpmjax.scan import PairEvidence
 
 NUM_SCANS, PLANAR_STEPS, DEPTH_STEPS = 160, (1, 4, 8, 16, 32, 64, 128), (1, 1, 2, 3)
 RIGHT_SHARE, RIGHT_M, RIGHT_RAD, SURE = 0.05, 0.1, np.radians(3.0), 0.9

@@ -37,10 +37,11 @@ gc.disable()
 
 # Before the first import of the package, so that the functions of these rooms (kernels and network) are wrapped: all
 # rooms would take twelve seconds of each worker. An integer is a float, as for mypy.
-CHECKED_ROOMS = ("checks", "deeppointmap", "geometry", "losses", "metrics", "nets", "pose_graph", "scans", "sequences")
+CHECKED_ROOMS = ("checks", "deeppointmap", "geometry", "losses", "metrics", "nets", "pose_graph", "sequences")
 CHECKED_FILES = (
     *("deepmapping.objective", "deepmapping.relocalization"),
-    *(f"registration_rgbd.{name}" for name in ("motion_search", "projective_consistency", "trajectory_search")),
+    "scan.lidar",
+    *(f"scan.depth.{name}" for name in ("propose", "compare", "track")),
 )
 jaxtyping.install_import_hook(
     [f"dpmjax.{name}" for name in (*CHECKED_ROOMS, *CHECKED_FILES)],

@@ -20,25 +20,23 @@ ALLOWED: dict[str, set[str]] = {
     "compile_cache": set(),
     "kept_programs": {"compile_cache"},
     "geometry": set(),
-    "scans": {"geometry"},
+    "scan": {"geometry", "pose_graph"},
     "nets": {"geometry"},
     "losses": {"geometry"},
     "pose_graph": {"geometry"},
-    "registration2d": {"geometry", "losses", "pose_graph", "scans"},
-    "registration_rgbd": {"geometry", "scans"},
-    "deepmapping": {"geometry", "nets", "losses", "registration_rgbd"},
-    "deeppointmap": {"geometry", "nets", "losses", "scans", "metrics"},
-    "slam": {"deeppointmap", "pose_graph", "geometry", "scans"},
-    "registration": {"deeppointmap", "registration2d", "registration_rgbd", "scans", "slam"},
-    "saved_maps": {"slam", "deeppointmap", "scans", "geometry", "weights", "io"},
+    "deepmapping": {"geometry", "nets", "losses", "scan"},
+    "deeppointmap": {"geometry", "nets", "losses", "scan", "metrics"},
+    "slam": {"deeppointmap", "pose_graph", "geometry", "scan"},
+    "registration": {"deeppointmap", "scan", "slam"},
+    "saved_maps": {"slam", "deeppointmap", "scan", "geometry", "weights", "io"},
     "metrics": {"geometry"},
     "io": {"geometry", "pose_graph"},
     "simulation": {"geometry"},
     "viz": {"geometry"},
     "weights": {"geometry", "nets", "deeppointmap"},
 }
-# This file joins classical registration with DeepMapping; all other files of its room import no network.
-ALLOWED_IN_FILE: dict[str, set[str]] = {"registration2d/pipeline.py": {"deepmapping"}}
+# This file joins the map of planar scans with DeepMapping.
+ALLOWED_IN_FILE: dict[str, set[str]] = {"slam/planar/pipeline.py": {"deepmapping"}}
 # The command imports every room, and no room imports it.
 ALLOWED |= {"cli": set(ALLOWED) - EVERYBODY_MAY, "__main__": {"cli"}}
 ONLY_IN: dict[str, set[str]] = {"matplotlib": {"viz", "io"}, "jaxlie": {"geometry"}, "torch": {"weights"}}

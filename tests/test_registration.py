@@ -7,12 +7,12 @@ import pytest
 import dpmjax
 from dpmjax import simulation
 from dpmjax.geometry import rigid, se2
-from dpmjax.scans.lidar import measure_scan
+from dpmjax.scan.lidar.record import measure_scan
 from dpmjax.simulation.walk2d import scan_world
 from dpmjax.slam.unposed import PairMotion, join_scans, refine_jointly
 from tests.deeppointmap import toy
 from tests.deeppointmap.test_lookalikes import T_TRUE, room
-from tests.scans.surface_scenes import motion, seen_from
+from tests.scan.surface_scenes import motion, seen_from
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,13 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax import deeppointmap, registration2d, registration_rgbd
+from dpmjax import deeppointmap, scan, slam
 from dpmjax.checks import runs_on_host
 from dpmjax.deeppointmap.encoding import ScanOrCloud
 from dpmjax.deeppointmap.model import Model
 from dpmjax.progress import progress_bar
-from dpmjax.registration2d.pipeline import RegisteredScans, RegistrationConfig, RegistrationHooks
-from dpmjax.scans.pair_registration import ScanRegistration
+from dpmjax.scan.pair_evidence import ScanRegistration
+from dpmjax.slam.planar.pipeline import RegisteredScans, RegistrationConfig, RegistrationHooks
 from dpmjax.slam.unposed import RegisteredClouds, register_unposed
 from dpmjax.types import RawScan, Registration, ScanSet
 
@@ -62,14 +62,14 @@ def register(model: Model | None, source: Any, target: Any, **options: Any) -> R
     """
     kinds = {_kind(scan) for scan in (source, target)}
     if kinds == {"planar"}:
-        return registration2d.register_planar(source, target)
+        return scan.register_planar(source, target)
     if kinds == {"depth"}:
-        return registration_rgbd.register_images(source, target)
+        return scan.register_images(source, target)
     if kinds & {"planar", "depth"}:
         shapes = " and ".join(str(np.shape(scan)) for scan in (source, target))
         raise ValueError(f"source, target: expected scans of one sensor, (n, 2), (h, w, 3) or (n, 3), got {shapes}")
     if model is None:
-        return deeppointmap.register_surfaces(source, target)
+        return scan.register_surfaces(source, target)
     return deeppointmap.register(model, source, target, **options)
 
 
@@ -98,7 +98,7 @@ def register_scans(
 ) -> RegisteredScans | RegisteredClouds:
     """Registers a set of scans of one sensor: planar scans, or 3-D scans without poses and order by a model.
 
-        register_scans(scans, config, key=key)              # planar: `registration2d.register_scans`
+        register_scans(scans, config, key=key)              # planar: `slam.register_scans`
         register_scans(model, clouds, is_ordered=False)     # 3-D: `slam.register_unposed`
 
     Args:
@@ -106,7 +106,7 @@ def register_scans(
         is_ordered: True if the scans are in time order. None takes the setting of planar scans, and False for 3-D
             scans. `run_slam` maps 3-D scans in time order.
         progress: False shows no bar; hooks of your own take its place.
-        **options: of `registration2d.register_scans`: key, start, odometry, hooks.
+        **options: of `slam.register_scans`: key, start, odometry, hooks.
 
     Returns:
         Poses of all scans, and the evidence for them.
@@ -128,4 +128,4 @@ def register_scans(
             bar.set_description(stage, refresh=False)
             bar.update(share - bar.n)
 
-        return registration2d.register_scans(*scans, hooks=hooks or RegistrationHooks(show), **options)
+        return slam.register_scans(*scans, hooks=hooks or RegistrationHooks(show), **options)

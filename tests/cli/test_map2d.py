@@ -15,8 +15,8 @@ from dpmjax.cli.depth import DepthOptions, read_images
 from dpmjax.cli.map2d import Map2dOptions, fit_settings, main, trust_verdict
 from dpmjax.cli.run import Run, load_json, run_command
 from dpmjax.io import InputError, ScanSequence
-from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
+from dpmjax.slam import register_scans
 from tests.data_sets import write_deepmapping_folder
 from tests.processes import run_python
 
@@ -117,7 +117,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
         os.kill(os.getpid(), signal.SIGINT)
         return register_scans(*options, **hooks)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("dpmjax.registration2d.register_scans", interrupted)
+    monkeypatch.setattr("dpmjax.slam.register_scans", interrupted)
     arguments = [str(scans_npz), "--init", "zero", "-o", str(tmp_path / "out")]
     assert run_command(main, name="map2d", description=None, args=arguments) == 130
     found = load_json(tmp_path / "out" / "metrics.json")

@@ -13,7 +13,7 @@ from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, with_raised_
 from dpmjax.cli.info import why_not_importable
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.io import write_tum
-from dpmjax.scans import offsets_by_azimuth
+from dpmjax.scan import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, slam_preset
 from tests.cli.test_slam import run, use_truth, write_drive
 from tests.deeppointmap import toy

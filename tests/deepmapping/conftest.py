@@ -7,7 +7,7 @@ from dpmjax import simulation
 from dpmjax.deepmapping.mapping import mapping_data
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.io import DepthSequence, ScanSequence
-from dpmjax.registration_rgbd import DepthScans, as_depth_scans
+from dpmjax.scan import DepthScans, as_depth_scans
 from dpmjax.types import ScanSet
 
 NUM_SCANS, NUM_BEAMS = 20, 64

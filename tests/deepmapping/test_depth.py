@@ -15,8 +15,8 @@ from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
-from dpmjax.registration_rgbd.depth_images import PixelSample, as_depth_scans, fit_pinhole, image_surface
-from dpmjax.registration_rgbd.projective_consistency import Agreement, image_agreement, projective_consistency
+from dpmjax.scan.depth.compare import Agreement, image_agreement, projective_consistency
+from dpmjax.scan.depth.record import PixelSample, as_depth_scans, fit_pinhole, image_surface
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)

@@ -10,7 +10,7 @@ import pytest
 
 from dpmjax import deepmapping as dm
 from dpmjax.geometry import typical_range
-from dpmjax.registration_rgbd import DepthScans, PlacedImages, initialize_depth, projective_consistency
+from dpmjax.scan import DepthScans, PlacedImages, initialize_depth, projective_consistency
 
 KEY = jax.random.key(3)
 CONFIG = replace(dm.preset("fast", "depth"), steps_per_call=1)

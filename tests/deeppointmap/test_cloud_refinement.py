@@ -6,7 +6,7 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap import calibrated_probability, merge_clouds, register_clouds
 from dpmjax.types import DescriptorCloud
-from tests.scans.surface_scenes import motion, seen_from, street
+from tests.scan.surface_scenes import motion, seen_from, street
 
 T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0.1), 1), motion(40, (-2, 1, 0), -1)
 T_B_A = np.linalg.inv(T_WORLD_B) @ T_WORLD_A

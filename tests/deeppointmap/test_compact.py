@@ -19,14 +19,14 @@ from dpmjax.deeppointmap.compact_scans import (
 )
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.model import model_fingerprint
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
-from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.scans.lidar import measure_scan
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, scan_surface, surface_of_elements
+from dpmjax.scan.lidar.choose import choose_motion, refine_motion
+from dpmjax.scan.lidar.compare import VerificationConfig
+from dpmjax.scan.lidar.record import measure_scan
+from dpmjax.scan.lidar.surfaces import Surface, SurfaceConfig, range_image, scan_surface, surface_of_elements
 from dpmjax.types import DescriptorCloud, SurfaceElements
-from tests.scans.surface_scenes import motion, seen_from, street
+from tests.scan.surface_scenes import motion, seen_from, street
 
 CONFIG = VerificationConfig(plane_radius_m=2.0)
 """Elements are metres apart."""

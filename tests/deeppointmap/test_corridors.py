@@ -9,12 +9,12 @@ from scipy.special import logit
 
 import dpmjax
 from dpmjax.deeppointmap import confidence as conf
-from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, verify_elements
-from dpmjax.deeppointmap.verification import VerificationConfig
-from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
-from dpmjax.scans.weak_directions import facing_samples, sliding_motions, wall_axis, weak_share, weakest_direction
+from dpmjax.scan.lidar.choose import VerifiedMotion, choose_motion, refine_motion, verify_elements
+from dpmjax.scan.lidar.compare import VerificationConfig
+from dpmjax.scan.lidar.record import Scan, measure_scan, measured_elements
+from dpmjax.scan.lidar.slide import facing_samples, sliding_motions, wall_axis, weak_share, weakest_direction
 from dpmjax.types import Registration, SurfaceElements, Verification
-from tests.scans.surface_scenes import corridor, motion, seen_from, street
+from tests.scan.surface_scenes import corridor, motion, seen_from, street
 
 CONFIG = VerificationConfig()
 PILLARS_M = (-13.0, -8.5, -2.0, 4.0, 5.5, 14.0)

@@ -13,7 +13,7 @@ from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.registration import register_each
 from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.scans import ViewCorrelationConfig
+from dpmjax.scan import ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED, ROUNDING

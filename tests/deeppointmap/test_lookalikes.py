@@ -10,11 +10,11 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap import registration
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
-from dpmjax.deeppointmap.verification import VerificationConfig
-from dpmjax.scans.lidar import measure_scan
+from dpmjax.scan.lidar.choose import choose_motion, refine_motion
+from dpmjax.scan.lidar.compare import VerificationConfig
+from dpmjax.scan.lidar.record import measure_scan
 from dpmjax.types import Registration
-from tests.scans.surface_scenes import motion, rectangle, seen_from, street
+from tests.scan.surface_scenes import motion, rectangle, seen_from, street
 
 CONFIG = VerificationConfig()
 POSES = motion(20, (-1.5, 0.4, 0.0)), motion(-75, (1.2, -0.8, 0.1))

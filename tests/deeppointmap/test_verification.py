@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.compact_scans import compact_elements, expand_elements
-from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
-from dpmjax.deeppointmap.verification import (
+from dpmjax.scan.lidar.choose import VerifiedMotion, choose_motion, refine_motion
+from dpmjax.scan.lidar.compare import (
     EVIDENCE,
     VerificationConfig,
     evidence_shares,
     verify_motions,
 )
-from dpmjax.scans.lidar import measure_scan
-from dpmjax.scans.surfaces import Surface, surface_of_elements
+from dpmjax.scan.lidar.record import measure_scan
+from dpmjax.scan.lidar.surfaces import Surface, surface_of_elements
 from dpmjax.types import SurfaceElements, Verification
-from tests.scans.surface_scenes import motion, seen_from, street
+from tests.scan.surface_scenes import motion, seen_from, street
 
 CONFIG = VerificationConfig()
 T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0), 1), motion(130, (-4, 3, 0))

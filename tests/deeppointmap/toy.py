@@ -12,7 +12,7 @@ from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
-from dpmjax.scans import PreprocessConfig
+from dpmjax.scan import PreprocessConfig
 from dpmjax.types import DescriptorCloud, Registration
 
 MODEL = dpm.ModelConfig(

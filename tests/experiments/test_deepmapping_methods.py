@@ -7,8 +7,8 @@ import pytest
 
 from dpmjax.cli.run import load_json
 from dpmjax.geometry import se2
-from dpmjax.registration2d import DEEPMAPPING
 from dpmjax.simulation import simulate_sequence
+from dpmjax.slam import DEEPMAPPING
 from experiments import deepmapping_logs, deepmapping_suite
 from experiments._deepmapping_methods import METHODS, PACKAGES, Task, make_task
 from experiments.deepmapping_logs import row_of

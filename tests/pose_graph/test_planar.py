@@ -4,7 +4,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.joint_alignment import solve_step
+from dpmjax.slam.planar.joint import solve_step
 
 
 def loop_of(num_poses: int = 40) -> np.ndarray:

@@ -13,8 +13,8 @@ from dpmjax import load_map, save_map
 from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan
 from dpmjax.io import InputError
 from dpmjax.saved_maps import load_state, map_bytes
-from dpmjax.scans.surfaces import SurfaceConfig, range_image, scan_surface
-from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.scan.lidar.slide import diagonal_information
+from dpmjax.scan.lidar.surfaces import SurfaceConfig, range_image, scan_surface
 from dpmjax.slam import SlamConfig
 from dpmjax.slam.keyframe_map import (
     Keyframe,

@@ -11,7 +11,7 @@ from dpmjax.deeppointmap import pooled_vector
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph import optimize_pose_graph
-from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.scan.lidar.slide import diagonal_information
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, as_pose_graph, submap_around
 from dpmjax.slam.loop_closure import (

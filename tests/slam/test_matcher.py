@@ -10,7 +10,7 @@ import dpmjax
 from dpmjax.deeppointmap.compact_scans import expand_elements
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.registration import match_clouds
-from dpmjax.scans import Scan
+from dpmjax.scan import Scan
 from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry
 from dpmjax.slam.model_methods import union_of
 from tests.deeppointmap import toy

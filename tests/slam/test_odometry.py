@@ -11,9 +11,9 @@ from dpmjax import model_preset
 from dpmjax.deeppointmap.compact_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans import Scan
-from dpmjax.scans.lidar import MAX_ELEMENTS, SPREAD_M
-from dpmjax.scans.weak_directions import sigma_along
+from dpmjax.scan import Scan
+from dpmjax.scan.lidar.record import MAX_ELEMENTS, SPREAD_M
+from dpmjax.scan.lidar.slide import sigma_along
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of

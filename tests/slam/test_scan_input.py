@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from dpmjax.scans import Scan
+from dpmjax.scan import Scan
 from dpmjax.slam import SlamConfig, SlamMethods, TimedScan, in_advance, run_slam
 from dpmjax.slam.system import corrected_points
 from tests.slam.truth import TruthGeometry, TruthMatcher, pose

@@ -11,7 +11,7 @@ import pytest
 from dpmjax import encode
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.scans import Scan
+from dpmjax.scan import Scan
 from dpmjax.slam import (
     Alignment,
     LocalMap,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.compact_scans import CompactElements, CompactImage, CompactScan, expand_elements
 from dpmjax.geometry import rigid
-from dpmjax.scans.lidar import Scan
-from dpmjax.scans.surfaces import surface_of_elements
+from dpmjax.scan.lidar.record import Scan
+from dpmjax.scan.lidar.surfaces import surface_of_elements
 from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap
 
 EMPTY = np.zeros((0, 3))

@@ -25,7 +25,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deepmapping, io, metrics, registration_rgbd, simulation, viz
+from dpmjax import cli, deepmapping, io, metrics, scan, simulation, viz
 from dpmjax.sequences import DepthSequence
 
 _NUM_SIMULATED = 8
@@ -48,7 +48,7 @@ def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     import jax
 
     sequence = read_images(options)
-    images = registration_rgbd.as_depth_scans(sequence.points, sequence.mask)
+    images = scan.as_depth_scans(sequence.points, sequence.mask)
     run.open()
     run.say(f"{sequence.name}: {len(sequence)} images")
     recorder = cli.FitRecorder(run, "m")
@@ -59,7 +59,7 @@ def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
         def on_image(num_placed: int, _: int) -> None:
             bar.update(num_placed - bar.n)
 
-        start = registration_rgbd.initialize_depth(images, settings.motion, key=key, on_image=on_image)
+        start = scan.initialize_depth(images, settings.motion, key=key, on_image=on_image)
     found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
     numbers = {**depth_numbers(sequence, found), **recorder.numbers}
     cli.write_poses(run.path, found.T_world_scan)

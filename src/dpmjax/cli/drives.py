@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import deeppointmap, io, metrics, scans, simulation, slam
+from dpmjax import deeppointmap, io, metrics, scan, simulation, slam
 from dpmjax.cli.options import Bound, ModelOptions, RunOptions, ScanOptions
 from dpmjax.cli.run import RESULTS, Run
 from dpmjax.sequences import InputError, LidarSequence, Note, ScanSequence
@@ -85,10 +85,10 @@ def open_path(path: Path, seed: int, **options: Any) -> LidarSequence:
 
 def with_raised_beams(drive: LidarSequence) -> LidarSequence:
     """Returns the drive with the beams of KITTI's lidar raised to their true elevation."""
-    from dpmjax.scans.corrections import KITTI_ELEVATION_DEG
+    from dpmjax.scan.lidar.corrections import KITTI_ELEVATION_DEG
 
     def read_scan(index: int) -> np.ndarray:
-        return scans.raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)
+        return scan.raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)
 
     return replace(drive, read_scan=read_scan)
 
@@ -246,7 +246,7 @@ class ScanReader:
             return points
         interval_s = self._interval_s(index)
         times = None if self.sequence.read_times is None else self.sequence.read_times(index)
-        offsets = None if times is None else scans.offsets_by_times(times, interval_s)
+        offsets = None if times is None else scan.offsets_by_times(times, interval_s)
         if offsets is not None:
             return slam.TimedScan(points, offsets if interval_s is not None else offsets / self._jump)
         if times is not None and not self._has_warned:
@@ -255,7 +255,7 @@ class ScanReader:
             LOGGER.warning("%s: %s", self.sequence.sources[index], text)
         # By the time of a turn, as a share of the time between scans.
         turn_share = 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
-        return slam.TimedScan(points, scans.offsets_by_azimuth(points, turn_share))
+        return slam.TimedScan(points, scan.offsets_by_azimuth(points, turn_share))
 
     def _interval_s(self, index: int) -> float | None:
         """Returns the time of the motion by which a scan is deskewed; None if it is unknown."""

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation, viz
+from dpmjax import cli, deepmapping, geometry, io, metrics, simulation, slam, viz
 from dpmjax.progress import progress_bar
 from dpmjax.sequences import FloatArray, ScanSequence
 
@@ -115,12 +115,12 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
-) -> registration2d.RegisteredScans:
+) -> slam.RegisteredScans:
     """Registers the scans with the recorder as engine of the fit, and prints each stage and its bar."""
     import jax
 
     fit = fit_settings(options, sequence)
-    config = registration2d.RegistrationConfig(
+    config = slam.RegistrationConfig(
         is_ordered=options.ordered,
         refine=options.refine,
         fit=fit,
@@ -143,9 +143,9 @@ def register_sequence(
         unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
         return partial(recorder, measure=ate_of(fitted, unit))
 
-    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine)
+    hooks = slam.RegistrationHooks(show, lambda: run.is_stopped, engine)
     with bar:
-        return registration2d.register_scans(
+        return slam.register_scans(
             scan_set_of(sequence),
             config,
             key=jax.random.key(options.seed),
@@ -155,7 +155,7 @@ def register_sequence(
         )
 
 
-def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> cli.Numbers:
+def map_numbers(sequence: ScanSequence, result: slam.RegisteredScans, options: Map2dOptions) -> cli.Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered, unit = sequence.take(result.recording.chosen), sequence.unit
     numbers: cli.Numbers = {
@@ -181,7 +181,7 @@ def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, 
         numbers["success"] = after[f"ate_{unit}"] < threshold
 
     def title(name: str) -> str:
-        return name.replace(registration2d.GIVEN_POSES, f"poses of {Path(options.init).name}")
+        return name.replace(slam.GIVEN_POSES, f"poses of {Path(options.init).name}")
 
     return {
         **numbers,
@@ -201,14 +201,14 @@ def read_scans(options: Map2dOptions) -> ScanSequence:
             options.world, num, range_noise_px=noise_px, seed=options.seed, with_odometry=True
         ).take(chosen)
     sequence = io.read_sequence(options.data, selection=chosen, topic=options.topic)
-    if not registration2d.find_originals(scan_set_of(sequence)).any():
+    if not slam.find_originals(scan_set_of(sequence)).any():
         raise ValueError(f"{options.data}: all scans are equal beam by beam; give scans of a robot that moves")
     return sequence
 
 
 def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
     """Returns the name of the initial poses, or the poses of the file of `--init` for all scans."""
-    init, words = options.init, ("auto", *registration2d.START_NAMES)
+    init, words = options.init, ("auto", *slam.START_NAMES)
     if init == "odometry" and sequence.odometry_poses is None:
         reason = "has no odometry of its own (its odometry column repeats the corrected pose, or is missing)"
         raise ValueError(f"{sequence.name}: {reason}; use --init icp-plane")
@@ -271,13 +271,13 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
 
 
 def draw_map(
-    run: cli.Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
+    run: cli.Run, registered: ScanSequence, result: slam.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept map, the reference. Returns its limits."""
     unit, reference = registered.unit, registered.reference_poses
     poses, anchor = {}, None
     for name, (title, found) in zip(result.candidates, numbers["candidates"].items(), strict=True):
-        if name not in (result.start, registration2d.DEEPMAPPING, result.kept):
+        if name not in (result.start, slam.DEEPMAPPING, result.kept):
             continue
         title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "") + "\n"
         errors = {"ATE": found.get(f"ate_{unit}"), "points": found.get(f"point_distance_{unit}")}.items()
@@ -290,9 +290,7 @@ def draw_map(
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
-def draw_occupancy(
-    run: cli.Run, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
-) -> None:
+def draw_occupancy(run: cli.Run, registered: ScanSequence, result: slam.RegisteredScans, limits: viz.Limits) -> None:
     """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses

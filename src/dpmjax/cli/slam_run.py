@@ -239,7 +239,7 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
     Returns:
         The points of all scans, thinned.
     """
-    from dpmjax.scans.preprocess import first_of_each_voxel
+    from dpmjax.scan.lidar.preprocess import first_of_each_voxel
 
     voxel_m, whole, fresh = MAP_VOXEL_M, np.zeros((0, 4), np.float32), list[np.ndarray]()
     for row, T in enumerate(tqdm(T_world_scan, desc="map", unit=" keyframes", dynamic_ncols=True)):

@@ -24,9 +24,9 @@ from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
-from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
-from dpmjax.registration_rgbd.projective_consistency import projective_consistency
-from dpmjax.registration_rgbd.trajectory_search import PlacedImages, initialize_depth
+from dpmjax.scan.depth.compare import projective_consistency
+from dpmjax.scan.depth.record import DepthScans, as_depth_scans
+from dpmjax.scan.depth.track import PlacedImages, initialize_depth
 from dpmjax.sequences import DepthSequence
 from dpmjax.types import ScanSet, with_short_repr
 

@@ -33,8 +33,8 @@ from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Problem, c
 from dpmjax.geometry import rigid, se2
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.mapping import LocalizationNet, init_map_net
-from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
-from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
+from dpmjax.scan.depth.compare import consistency_of_pairs
+from dpmjax.scan.depth.record import DepthScans, PixelSample
 from dpmjax.types import ScanSet
 
 _ALL = slice(None)

@@ -52,11 +52,6 @@ from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig
 from .model_config import model_preset as model_preset
-from .motion_choice import COARSE as COARSE
-from .motion_choice import FINE as FINE
-from .motion_choice import VerifiedMotion as VerifiedMotion
-from .motion_choice import choose_motion as choose_motion
-from .motion_choice import refine_motion as refine_motion
 from .overlap_prediction import OVERLAP_M as OVERLAP_M
 from .overlap_prediction import evidence_pairs as evidence_pairs
 from .overlap_prediction import head_probability as head_probability
@@ -68,7 +63,6 @@ from .registration import match_clouds as match_clouds
 from .registration import register as register
 from .registration import register_clouds as register_clouds
 from .registration import register_pairs as register_pairs
-from .registration import register_surfaces as register_surfaces
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import OverlapConfig as OverlapConfig
 from .training.curriculum import SamplingConfig as SamplingConfig
@@ -114,6 +108,3 @@ from .training.step import TrainingState as TrainingState
 from .training.step import finish as finish
 from .training.step import init_training as init_training
 from .training.step import make_step as make_step
-from .verification import EvidenceWeights as EvidenceWeights
-from .verification import VerificationConfig as VerificationConfig
-from .verification import evidence_shares as evidence_shares

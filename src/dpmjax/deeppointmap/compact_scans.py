@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
-from dpmjax.scans.lidar import Scan
-from dpmjax.scans.surfaces import RangeImage, surface_of_elements
+from dpmjax.scan.lidar.record import Scan
+from dpmjax.scan.lidar.surfaces import RangeImage, surface_of_elements
 from dpmjax.types import DescriptorCloud, SurfaceElements
 
 MAX_COORDINATE = np.iinfo(np.int16).max

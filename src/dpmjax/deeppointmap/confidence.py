@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
+from dpmjax.scan.lidar.compare import CORRIDOR_CONFIDENCE, MAX_SCORE
 from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("log_support", "mean_score", "rmse_m", "lead_share")
@@ -26,11 +27,6 @@ SCAN_FEATURES = (
 )
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
-# Where walls constrain one direction only, wrong motions reach higher log odds, too.
-MAX_SCORE = 3.0
-# The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure. The share has the
-# best likelihood on places left out of the fit (by a script, on the pairs of `experiments.dpm_calibrate`).
-CORRIDOR_CONFIDENCE = 0.88
 # Niches and pillars at equal steps repeat at other places, which lead by up to 39 elements (simulated tunnels, 56 to
 # 157 m off). Two scans a few metres apart have a lead of 38 to 146.
 CLEAR_FACING_GAP = 40.0

@@ -24,8 +24,8 @@ from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.geometry.shells import without_shell
 from dpmjax.kept_programs import kept_jit
 from dpmjax.reading import read_path
-from dpmjax.scans.lidar import Scan, measure_scan
-from dpmjax.scans.preprocess import preprocess_scan_on_host
+from dpmjax.scan.lidar.preprocess import preprocess_scan_on_host
+from dpmjax.scan.lidar.record import Scan, measure_scan, valid_points
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
 # Number of scans in one call of a compiled program.
@@ -147,13 +147,6 @@ def encode_pyramids(
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
         parts.append(jax.device_get(_encode_chunk(model, stacked, num_elements=num_elements)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
-
-
-def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
-    """Returns the points of a scan that its mask allows, as an array of NumPy."""
-    if isinstance(points, PointCloud):
-        return np.asarray(points.points)[np.asarray(points.mask)]
-    return as_host_points("points", points)
 
 
 def pyramid_of_scan(points: RawScan, config: ModelConfig) -> PointPyramid:

@@ -21,12 +21,12 @@ from scipy.spatial import cKDTree
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import descriptors_of, encode, prepare_scans
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
 from dpmjax.deeppointmap.registration import distinct_motions, match_clouds
 from dpmjax.geometry import se2
 from dpmjax.geometry.rigid import inverse
 from dpmjax.metrics.drives import path_lengths
+from dpmjax.scan.lidar.choose import choose_motion, refine_motion
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud, Pose, Poses
 

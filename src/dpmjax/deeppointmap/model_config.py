@@ -8,12 +8,12 @@ from typing import Literal, get_args
 from dpmjax.checks import require_one_of, require_positive, require_value
 from dpmjax.deeppointmap.confidence import Calibration, LogisticModel
 from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
-from dpmjax.scans.preprocess import PreprocessConfig
+from dpmjax.scan.lidar.compare import VerificationConfig
+from dpmjax.scan.lidar.preprocess import PreprocessConfig
 
 Preset = Literal["tiny", "small", "paper"]
 

@@ -27,7 +27,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
 from dpmjax.kept_programs import kept_jit
-from dpmjax.scans.lidar import Scan
+from dpmjax.scan.lidar.record import Scan
 from dpmjax.types import DescriptorCloud
 
 # Scans that are nearer to each other overlap.

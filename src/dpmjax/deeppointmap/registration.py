@@ -14,12 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.special import expit
 
 from dpmjax.checks import require_pairs, require_type, runs_on_host
 from dpmjax.deeppointmap.confidence import (
-    CORRIDOR_CONFIDENCE,
-    MAX_SCORE,
     MatchEvidence,
     gather_evidence,
     with_confidence,
@@ -30,22 +27,19 @@ from dpmjax.deeppointmap.encoding import (
     descriptors_of,
     encode,
     prepare_scans,
-    valid_points,
 )
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, verify_elements
-from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.kept_programs import kept_jit
 from dpmjax.reading import read_path
-from dpmjax.scans.align import LEVELS, align_on_host
-from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
-from dpmjax.scans.pair_registration import PairEvidence, ScanRegistration
-from dpmjax.scans.pairs import nearest_planes
-from dpmjax.scans.sizes import matched_share, relative_size
-from dpmjax.scans.weak_directions import WeakDirection, corridor_axis, plane_information, weakest_direction
+from dpmjax.scan.lidar.align import LEVELS, align_on_host
+from dpmjax.scan.lidar.choose import choose_motion, refine_motion, verify_elements
+from dpmjax.scan.lidar.compare import CORRIDOR_CONFIDENCE, VerificationConfig
+from dpmjax.scan.lidar.record import Scan, measure_scan, measured_elements, valid_points
+from dpmjax.scan.lidar.sizes import matched_share, relative_size
+from dpmjax.scan.lidar.slide import WeakDirection, corridor_axis, weakest_direction
 from dpmjax.types import DescriptorCloud, Pose, Poses, RawScan, Registration, Verification
 
 # Probability from which one way is enough: of 517 such motions of real pairs two were wrong.
@@ -417,42 +411,3 @@ def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, 
         return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
 
     return match_hypotheses(source, target, similarity, offsets, config=config)
-
-
-@runs_on_host("call icp there")
-def register_surfaces(source: RawScan, target: RawScan) -> ScanRegistration:
-    """Registers two lidar scans without a first guess and without a model, as `register` does without descriptors.
-
-    Args:
-        source: (n, 3) points in metres, in the frame of the lidar, z up, or their file; points that are not finite are
-            dropped.
-        target: the same.
-
-    Returns:
-        The motion, and the probability that it is right within 2 m and 5 degrees, by the agreement of the scans.
-
-    Raises:
-        ValueError: the points are no real numbers (n, 3).
-    """
-    config = VerificationConfig()
-    given = (cast(RawScan, read_path(scan, "io.read_lidar_file")) for scan in (source, target))
-    ends = tuple(measure_scan(valid_points(points), config.surface) for points in given)
-    chosen = choose_motion(ends[0], ends[1], np.eye(4)[None], config)
-    T = refine_motion(ends[0], ends[1], chosen, config).T_target_source
-    agreement, surfaces = chosen.verification, (ends[0].surface, ends[1].surface)
-    direction, sigma = weakest_direction(*surfaces, T, config.plane_radius_m)
-    pairs = nearest_planes(*surfaces, T[None], config.plane_radius_m, config.num_samples).take(0)
-    confidence = float(expit(min(agreement.score, MAX_SCORE)) * expit(agreement.lookalike_gap))
-    return ScanRegistration(
-        T_target_source=T,
-        confidence=min(confidence, CORRIDOR_CONFIDENCE) if agreement.num_slid else confidence,
-        evidence=PairEvidence(
-            score=agreement.score,
-            lead=float(min(agreement.gap, agreement.lookalike_gap)),
-            visible=agreement.visible_share,
-            sigma=float(sigma),
-        ),
-        weak_direction=np.asarray(direction),
-        weak_sigma=float(sigma),
-        information=plane_information(pairs.take(pairs.is_paired), T),
-    )

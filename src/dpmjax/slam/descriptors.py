@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.scan.lidar.slide import diagonal_information
 from dpmjax.slam.config import DescriptorConfig
 from dpmjax.slam.front_end import UNKNOWN_M, FrontEndState, RegisteredScan, ScanReport, empty_reason, with_keyframe
 from dpmjax.slam.interfaces import Match, PreparedInput, SlamMethods

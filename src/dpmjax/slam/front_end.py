@@ -14,8 +14,8 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
-from dpmjax.scans.lidar import Scan
-from dpmjax.scans.weak_directions import diagonal_information, sigma_along
+from dpmjax.scan.lidar.record import Scan
+from dpmjax.scan.lidar.slide import diagonal_information, sigma_along
 from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.compact_scans import CompactScan
-from dpmjax.scans.lidar import Scan
+from dpmjax.scan.lidar.record import Scan
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframe_map import MapOrigin, Submap
 from dpmjax.slam.local_map import LocalMap

@@ -16,7 +16,7 @@ from dpmjax.deeppointmap.compact_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
+from dpmjax.scan.lidar.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around
 from dpmjax.types import AnyArray, Pose

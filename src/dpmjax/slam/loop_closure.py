@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax.scans.apart import apart
+from dpmjax.scan.apart import apart
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
 from dpmjax.slam.loops import (

@@ -16,7 +16,7 @@ from jaxtyping import Int
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.scans.weak_directions import diagonal_information, with_least_covariance
+from dpmjax.scan.lidar.slide import diagonal_information, with_least_covariance
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, as_pose_graph, measured_parts
 from dpmjax.types import Information, Pose, Poses

@@ -21,15 +21,15 @@ from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import descriptors_of, pooled_vector, pyramid_of_cloud
 from dpmjax.deeppointmap.matching import MatchConfig, merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
-from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overlap
 from dpmjax.deeppointmap.registration import distinct_motions, match_clouds, register_each
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.align import align_on_host
-from dpmjax.scans.lidar import Scan
-from dpmjax.scans.pairs import nearest_planes
-from dpmjax.scans.preprocess import cloud_without_outliers
-from dpmjax.scans.weak_directions import diagonal_information, plane_information
+from dpmjax.scan.lidar.align import align_on_host
+from dpmjax.scan.lidar.choose import ELEMENT_RADIUS_M, REFINEMENT
+from dpmjax.scan.lidar.pairs import nearest_planes
+from dpmjax.scan.lidar.preprocess import cloud_without_outliers
+from dpmjax.scan.lidar.record import Scan
+from dpmjax.scan.lidar.slide import diagonal_information, plane_information
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import Match, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.align import ALL, AlignmentLevel, align_on_host
-from dpmjax.scans.apart import apart
-from dpmjax.scans.lidar import Scan, lidar_scan
-from dpmjax.scans.pairs import Pairs, nearest_planes
-from dpmjax.scans.surfaces import Surface, view_points
-from dpmjax.scans.weak_directions import plane_information, with_least_covariance, without_noise_along
+from dpmjax.scan.apart import apart
+from dpmjax.scan.lidar.align import ALL, AlignmentLevel, align_on_host
+from dpmjax.scan.lidar.pairs import Pairs, nearest_planes
+from dpmjax.scan.lidar.record import Scan, lidar_scan
+from dpmjax.scan.lidar.slide import plane_information, with_least_covariance, without_noise_along
+from dpmjax.scan.lidar.surfaces import Surface, view_points
 from dpmjax.sequences import homogeneous
 from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap

@@ -21,7 +21,7 @@ from dpmjax.pose_graph.free_nodes import pose_covariances
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
-from dpmjax.scans.corrections import deskew
+from dpmjax.scan.lidar.corrections import deskew
 from dpmjax.slam import descriptors, front_end, loop_closure
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport

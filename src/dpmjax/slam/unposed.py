@@ -28,11 +28,11 @@ from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
-from dpmjax.scans.align import AlignmentLevel, align_on_host
-from dpmjax.scans.lidar import Scan
-from dpmjax.scans.pairs import nearest_planes
-from dpmjax.scans.surfaces import Surface
-from dpmjax.scans.weak_directions import scattered_information, with_least_covariance
+from dpmjax.scan.lidar.align import AlignmentLevel, align_on_host
+from dpmjax.scan.lidar.pairs import nearest_planes
+from dpmjax.scan.lidar.record import Scan
+from dpmjax.scan.lidar.slide import scattered_information, with_least_covariance
+from dpmjax.scan.lidar.surfaces import Surface
 from dpmjax.types import Information, Pose, Poses, RawScan
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable

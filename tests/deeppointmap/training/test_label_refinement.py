@@ -11,7 +11,7 @@ from dpmjax.geometry import rigid
 from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
 from tests.deeppointmap.test_compact import room
-from tests.scans.surface_scenes import motion, seen_from
+from tests.scan.surface_scenes import motion, seen_from
 
 
 @pytest.mark.parametrize("shift", [(0.3, -0.2, 0.1), (-0.4, 0.1, -0.1)])

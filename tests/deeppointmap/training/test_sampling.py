@@ -8,6 +8,7 @@ import pytest
 from dpmjax import deeppointmap as dpm
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
+from dpmjax.scan import VerificationConfig
 
 
 def table(num: int = 60, step_m: float = 2.0) -> ScanTable:
@@ -157,7 +158,7 @@ def test_stages_follow_each_other() -> None:
         (lambda: dpm.OverlapConfig(num_epochs=0), "num_epochs"),
         (lambda: dpm.OverlapConfig(rate_share=0.0), "rate_share"),
         (lambda: dpm.MatchConfig(pair_ratio=5.0), "pair_ratio"),
-        (lambda: dpm.VerificationConfig(num_samples=0), "num_samples"),
+        (lambda: VerificationConfig(num_samples=0), "num_samples"),
     ],
 )
 def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:

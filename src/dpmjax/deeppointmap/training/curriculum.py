@@ -18,7 +18,7 @@ from dpmjax.checks import require_count, require_fields, require_one_of, require
 from dpmjax.deeppointmap.model import Initialization
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, Stage, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
-from dpmjax.scans.augment import AugmentConfig
+from dpmjax.scan.lidar.augment import AugmentConfig
 
 # Probability that all groups of a step are pairs of scans, whatever the stage; other steps may draw pairs, too.
 PAIR_PROBABILITY = 0.34

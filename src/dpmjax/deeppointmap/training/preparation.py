@@ -26,8 +26,8 @@ from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.evaluation import true_poses
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
 from dpmjax.geometry.pyramid_storage import record_type, store_pyramid
-from dpmjax.scans.augment import SPARSE_POINTS, AugmentConfig, augment_scan
-from dpmjax.scans.preprocess import MAX_CAPACITY, preprocess_scan_on_host
+from dpmjax.scan.lidar.augment import SPARSE_POINTS, AugmentConfig, augment_scan
+from dpmjax.scan.lidar.preprocess import MAX_CAPACITY, preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import PointCloud, Poses
 

@@ -38,7 +38,7 @@ from dpmjax.deeppointmap.training.sampling import (
     draw_groups,
 )
 from dpmjax.geometry.pyramid_storage import sampled_positions, stored_pyramids
-from dpmjax.scans.augment import random_motions_on_host
+from dpmjax.scan.lidar.augment import random_motions_on_host
 from dpmjax.sequences import LidarSequence
 
 SAMPLE_STREAM, EPOCH_STREAM = 3101, 3102

@@ -1,0 +1,1 @@
+"""Depth images: record, comparison by projection, search and alignment of motions."""

@@ -1,0 +1,1 @@
+"""Planar scans: record, views, search, alignment and slides of pairs."""
