@@ -9,6 +9,7 @@ from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.cli.slam_run import judge
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
+from dpmjax.slam import assess_map
 from tests.cli.test_slam import run
 from tests.data_sets import write_pcd
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -59,10 +60,11 @@ def test_a_drive_of_empty_scans_fails(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_the_status_follows_from_the_scans(statuses: dict[str, int], status: str, reason: str) -> None:
     numbers = dict.fromkeys(("path_m", "num_keyframes", "num_new_keyframes", "num_loops"), 0)
     numbers |= {"scan_statuses": statuses, "reference_doubt": None}
-    found = judge({**numbers, "num_parts": 1})
+    names = [name for name, count in statuses.items() for _ in range(count)]
+    found = judge(assess_map(names, 1), numbers)
     assert found["status"] == status
     assert reason in found["verdict"]
-    assert judge({**numbers, "num_parts": 2})["status"] == ("uncertain" if status == "done" else status)
+    assert judge(assess_map(names, 2), numbers)["status"] == ("uncertain" if status == "done" else status)
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(tmp_path: Path) -> None:

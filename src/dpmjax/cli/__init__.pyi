@@ -30,6 +30,7 @@ from .options import RunOptions as RunOptions
 from .options import ScanOptions as ScanOptions
 from .options import check_names as check_names
 from .options import parse_options as parse_options
+from .options import trust_words as trust_words
 from .program import end_process as end_process
 from .program import main as main
 from .recorded_fit import FitRecorder as FitRecorder

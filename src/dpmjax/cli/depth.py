@@ -91,7 +91,7 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
     is_trusted, uncertain = found.placed.is_trusted, list(found.placed.uncertain_images)
-    verdict = f"{'can be trusted' if is_trusted else 'DO NOT TRUST this map'}: the images agree to {consistency:.0%}"
+    verdict = f"{cli.trust_words(is_trusted)}: the images agree to {consistency:.0%}"
     if uncertain:
         verdict += f"; uncertain images, which others hardly explain or contradict: {', '.join(map(str, uncertain))}"
     elif not is_trusted:

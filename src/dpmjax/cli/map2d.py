@@ -241,11 +241,10 @@ def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
 
 def trust_verdict(assessment: Mapping[str, Any]) -> str:
     """Returns the verdict on trust with its reason, the fault of the odometry, and the uncertain scans."""
-    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     # Near zero the difference of two shares has either sign.
     contradiction, weakest = max(assessment["contradiction"], 0.0), assessment["weakest_connection"]
-    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {contradiction:.1%} more beams than between "
-    text += "the best pairs end in the free space of another scan"
+    text = f"{cli.trust_words(assessment['is_trusted'])}: the weakest connection scores {weakest:.2f} of 1; "
+    text += f"{contradiction:.1%} more beams than between the best pairs end in the free space of another scan"
     if assessment["fault"] is not None:
         text += f"; {assessment['fault']}"
     if count := len(assessment["uncertain_scans"]):

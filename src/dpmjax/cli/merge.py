@@ -25,7 +25,6 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_run
 from dpmjax.sequences import counted
 
 # Points below this height above the lidar are the ground.
@@ -85,7 +84,7 @@ def merge_numbers(names: Sequence[str], files: Sequence[str], merged: slam.Merge
     texts = [f"{counted(len(ends), 'loop')} between maps, of {counted(len(merged.loops), 'candidate')}"]
     for part, (file, slam_map) in enumerate(zip(files, merged.maps, strict=True)):
         members = [number for number, component in enumerate(merged.component, start=1) if component == part]
-        num_measured, counts = slam_run.count_parts(slam_map), {"num_keyframes": len(slam_map)}
+        num_measured, counts = len(set(slam.measured_parts(slam_map).tolist())), {"num_keyframes": len(slam_map)}
         parts.append({"file": file, "maps": members, **counts, "num_measured_parts": num_measured})
         text = "one map now" if len(members) > 1 else "no common place with another map"
         text += f", in {num_measured} parts whose relative poses are guesses" if num_measured > 1 else ""

@@ -131,3 +131,8 @@ def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> No
     unknown = [name for name in names if name not in allowed]
     if unknown or not names:
         raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")
+
+
+def trust_words(is_trusted: bool) -> str:
+    """Returns the beginning of a verdict on a map, the same for every sensor."""
+    return "can be trusted" if is_trusted else "DO NOT TRUST this map"

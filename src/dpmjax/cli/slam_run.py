@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from dpmjax import geometry, metrics, saved_maps, slam, viz
 from dpmjax.cli.drives import ScanReader
+from dpmjax.cli.options import trust_words
 from dpmjax.cli.run import Numbers, Run, write_table
 from dpmjax.sequences import LidarSequence, counted
 
@@ -31,9 +32,6 @@ SCAN_COLUMNS = (
     "source",
 )  # fmt: skip
 
-
-# Of 120 scans of a sound drive up to five are guessed; 53 blind ones ended metres off.
-MAX_GUESSED_SHARE = 0.1
 
 UNSURE = {
     "network": "placed by the network: at the start, or because alignment with the scans before failed",
@@ -313,7 +311,7 @@ def require_same_weights(path: Path, slam_map: slam.KeyframeMap, methods: slam.S
 
 def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
     """Returns the numbers of a map for `metrics.json`; the sequence has the scans that were placed."""
-    T, reference = result.T_world_scan, sequence.T_world_lidar
+    T, reference, assessment = result.T_world_scan, sequence.T_world_lidar, result.assessment
     loops = collections.Counter(loop.status for loop in result.loops)
     numbers = {
         "sequence": sequence.name,
@@ -322,57 +320,46 @@ def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
         "reference_doubt": metrics.reference_doubt(T, sequence),
         "num_keyframes": len(result.keyframes),
         "num_new_keyframes": sum(report.is_keyframe for report in result.reports),
-        "num_parts": count_parts(result.map),
+        "num_parts": assessment.num_parts,
+        "is_trusted": assessment.is_trusted,
+        "uncertain_scans": list(assessment.uncertain_scans),
         "num_loops": loops["accepted"],
         **metrics.trajectory_errors(T, reference),
         **metrics.trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
         "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
         "loop_statuses": dict(loops),
     }
-    return {**judge(numbers), **numbers}
+    return {**judge(assessment, numbers), **numbers}
 
 
-def count_parts(slam_map: slam.KeyframeMap) -> int:
-    """Returns the number of parts of a map that measured motions join."""
-    return len(set(slam.measured_parts(slam_map).tolist()))
-
-
-def judge(numbers: Numbers) -> Numbers:
+def judge(assessment: slam.MapAssessment, numbers: Numbers) -> Numbers:
     """Returns status and verdict of a run that came to its end.
 
     Args:
+        assessment: of the map.
         numbers: of the run.
 
     Returns:
-        The status "done", "uncertain" or "failed", and one sentence. A run is uncertain if more than one scan and more
-        than a tenth of all scans were not aligned in all directions. It is also uncertain if no loop joins all parts of
-        the map. It failed if no scan was aligned. The sentence names the size of the map, and its uncertain or wrong
-        parts.
+        The status "done", "uncertain" or "failed", and one sentence: whether the map can be trusted, its size, and its
+        uncertain or wrong parts.
     """
-    statuses, num_parts = numbers["scan_statuses"], numbers["num_parts"]
-    num_scans = sum(statuses.values())
-    scans, reason = counted(num_scans, "scan"), None
-    if num_scans and statuses.get("empty") == num_scans:
-        reason = f"{num_scans} of {scans} without enough points, no map was made"
-    elif num_scans > 1 and not {"tracked", "network", "coasting"} & statuses.keys():
-        reason = f"none of {scans} could be aligned with those before, the trajectory is no result"
-    if reason is not None:
+    if assessment.fault is not None:
         advice = "check that the scans are 3-D, in metres, and follow each other"
-        return {"status": "failed", "verdict": f"{reason}: {advice}"}
-    num_guessed = num_scans - sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
-    is_sure = num_parts < 2 and num_guessed <= max(1, MAX_GUESSED_SHARE * num_scans)
-    text = f"{scans}, {numbers['path_m']:.1f} m driven, {counted(numbers['num_new_keyframes'], 'keyframe')}"
+        return {"status": "failed", "verdict": f"{assessment.fault}: {advice}"}
+    statuses, scans = numbers["scan_statuses"], counted(sum(numbers["scan_statuses"].values()), "scan")
+    text = f"{trust_words(assessment.is_trusted)}: {scans}, {numbers['path_m']:.1f} m driven, "
+    text += counted(numbers["num_new_keyframes"], "keyframe")
     if numbers["num_keyframes"] > numbers["num_new_keyframes"]:
         text += f" ({numbers['num_keyframes']} in the map)"
     text += f", {counted(numbers['num_loops'], 'loop closure')}"
     for status, found in UNSURE.items():
         if status in statuses:
             text += f"; {counted(statuses[status], 'scan')} {found} (scans.csv has the reasons)"
-    if num_parts > 1:
-        text += f"; the map has {num_parts} parts that no loop joins; their relative pose is a guess"
+    if assessment.num_parts > 1:
+        text += f"; the map has {assessment.num_parts} parts that no loop joins; their relative pose is a guess"
     if numbers["reference_doubt"] is not None:
         text += f"; warning: {numbers['reference_doubt']}"
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM")):
         if f"ate{suffix}_m" in numbers:
             text += f"; ATE of {name} {numbers[f'ate{suffix}_m']:.3f} m"
-    return {"status": "done" if is_sure else "uncertain", "verdict": text}
+    return {"status": "done" if assessment.is_trusted else "uncertain", "verdict": text}

@@ -2,6 +2,8 @@ from .agents import AgentsResult as AgentsResult
 from .agents import MergedMaps as MergedMaps
 from .agents import merge_maps as merge_maps
 from .agents import run_agents as run_agents
+from .assess import MapAssessment as MapAssessment
+from .assess import assess_map as assess_map
 from .config import DescriptorConfig as DescriptorConfig
 from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig

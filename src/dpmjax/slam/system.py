@@ -23,10 +23,11 @@ from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scan.lidar.corrections import deskew
 from dpmjax.slam import descriptors, front_end, loop_closure
+from dpmjax.slam.assess import MapAssessment, assess_map
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
-from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
+from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph, measured_parts
 from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted, optimize_map
 from dpmjax.slam.model_methods import as_methods
 from dpmjax.types import Pose, Poses, with_short_repr
@@ -109,6 +110,12 @@ class SlamResult(NamedTuple):
     def map(self) -> KeyframeMap:
         """The map: keyframes, poses and edges."""
         return self.state.slam_map
+
+    @property
+    def assessment(self) -> MapAssessment:
+        """Whether the map can be trusted, and its uncertain scans."""
+        num_parts = len(set(measured_parts(self.map).tolist()))
+        return assess_map([report.status for report in self.reports], num_parts)
 
 
 def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
