@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import jax
 import numpy as np
@@ -19,9 +19,10 @@ from dpmjax.deeppointmap.encoding import ScanOrCloud
 from dpmjax.deeppointmap.model import Model
 from dpmjax.progress import progress_bar
 from dpmjax.scan.pair_evidence import ScanRegistration
-from dpmjax.slam.planar.pipeline import RegisteredScans, RegistrationConfig, RegistrationHooks
-from dpmjax.slam.unposed import RegisteredClouds, register_unposed
 from dpmjax.types import RawScan, Registration, ScanSet
+
+if TYPE_CHECKING:  # a registration of two scans needs no DeepMapping, which takes a while to load
+    from dpmjax.slam import RegisteredClouds, RegisteredScans, RegistrationConfig
 
 
 @overload
@@ -117,9 +118,9 @@ def register_scans(
     if isinstance(scans[0], Model):
         if is_ordered:
             raise ValueError("is_ordered: expected False for 3-D scans; run_slam maps them in the order of time")
-        return register_unposed(*scans, progress=progress, **options)
+        return slam.register_unposed(*scans, progress=progress, **options)
     if is_ordered is not None:
-        config = (scans[1] if len(scans) > 1 else options.pop("config", None)) or RegistrationConfig()
+        config = (scans[1] if len(scans) > 1 else options.pop("config", None)) or slam.RegistrationConfig()
         scans = (scans[0], replace(config, is_ordered=is_ordered))
     hooks = options.pop("hooks", None)
     with progress_bar("registration", is_shown=progress and hooks is None) as bar:
@@ -128,4 +129,4 @@ def register_scans(
             bar.set_description(stage, refresh=False)
             bar.update(share - bar.n)
 
-        return slam.register_scans(*scans, hooks=hooks or RegistrationHooks(show), **options)
+        return slam.register_scans(*scans, hooks=hooks or slam.RegistrationHooks(show), **options)

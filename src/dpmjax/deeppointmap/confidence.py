@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy  # loads scipy.optimize, which takes a third of a second, when it is needed
 from jaxtyping import Array, Bool, Float
-from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from dpmjax.scan.lidar.compare import CORRIDOR_CONFIDENCE, MAX_SCORE
@@ -263,7 +263,7 @@ def fit_weights(
         ridge = RIDGE * np.append(weights[:-1], 0.0)
         return float(losses.mean() + ridge @ weights / 2), standard.T @ slopes / len(slopes) + ridge
 
-    found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
+    found = scipy.optimize.minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
     return tuple(weights.tolist()), float(found[-1] - weights @ mean)
 

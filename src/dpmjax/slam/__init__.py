@@ -1,4 +1,4 @@
-"""SLAM: a stream of scans becomes one map by keyframes, odometry, loop closure and one pose graph (DeepPointMap 4)."""
+"""One map of many scans: of a stream of lidar scans (DeepPointMap 4), of a set without order, or of planar scans."""
 
 import lazy_loader as _lazy
 

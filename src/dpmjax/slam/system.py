@@ -1,6 +1,6 @@
 """The whole system: scan by scan, front end, loop closure and optimisation make one map.
 
-A thread thins and encodes scans one scan ahead, because this needs no map.
+A thread prepares scans one scan ahead, because this needs no map; scans with times wait for the motion before them.
 """
 
 from __future__ import annotations

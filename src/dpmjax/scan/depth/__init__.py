@@ -1,1 +1,1 @@
-"""Depth images: record, comparison by projection, search and alignment of motions."""
+"""Depth images: record, comparison by projection, search and alignment of motions, tracking of a sequence."""

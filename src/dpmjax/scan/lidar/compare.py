@@ -1,6 +1,6 @@
 """Verification of motion hypotheses by the scans themselves: surfaces that meet, and free space that stays free.
 
-A short point-to-plane alignment first improves a hypothesis. A right one then puts most points of each scan onto planes
+`choose.py` first aligns a hypothesis. A right one then puts most points of each scan onto planes
 of the opposite scan, and hardly any into its free space.
 """
 

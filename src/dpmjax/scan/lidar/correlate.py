@@ -2,7 +2,7 @@
 
 Upright surfaces are drawn into images by the direction of their normals, one image for each turn about the vertical.
 One FFT gives the correlation for all shifts of one turn (correlative scan matching, Olson 2009). The best distinct
-peaks are motions within a cell and half a step of the turn; `align_surfaces` finishes them.
+peaks are motions within a cell and half a step of the turn; `choose.py` aligns them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Steps of a sequence: their priors, the posterior of their shifts, and pose-graph edges from them.
-
-Priors come from odometry, given poses or the usual motion.
+"""Posterior of the shifts of steps along their weak directions, and pose-graph edges from it.
 
 The weak direction is the direction in which the walls give the least information about the translation. Two scans of a
 corridor fit at every shift along it, and a local alignment stops at the first of these shifts. So the scores of a step

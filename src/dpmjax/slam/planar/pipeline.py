@@ -1,6 +1,6 @@
 """Registration of planar scans by one call: initial poses, DeepMapping, refinement, and the choice among the results.
 
-`register_scans` joins the functions of this room with DeepMapping; no other file of the room imports `deepmapping`. A
+`register_scans` joins the functions of this folder with DeepMapping; no other file of `slam` imports `deepmapping`. A
 candidate is a trajectory under the name of the method that produced it: "DeepMapping" is the result of L-Net or M-Net.
 """
 
