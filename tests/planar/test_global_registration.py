@@ -11,8 +11,8 @@ from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scan import PlanarScans, planar_scans
-from dpmjax.scan.planar import correlate as pair_search
-from dpmjax.scan.planar.correlate import (
+from dpmjax.scan.planar import propose as pair_search
+from dpmjax.scan.planar.propose import (
     CorrelativeConfig,
     Hypotheses,
     search_pairs,

@@ -20,7 +20,8 @@ from dpmjax.scan.depth.align import (
     linearise_images,
     step_poses,
 )
-from dpmjax.scan.depth.propose import MAX_TRANSLATION, propose_motions, slide_margin
+from dpmjax.scan.depth.propose import MAX_TRANSLATION, propose_motions
+from dpmjax.scan.depth.slide import slide_margin
 from dpmjax.scan.depth.track import explained_shares
 from dpmjax.sequences import ACTIVE_VISION
 from dpmjax.simulation.apartments import cast_depth, make_apartment

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.scan.lidar.correlate import NUM_CELLS, ViewCorrelationConfig, _best_peaks, correlate_views
+from dpmjax.scan.lidar.propose import NUM_CELLS, ViewCorrelationConfig, _best_peaks, correlate_views
 from dpmjax.scan.lidar.surfaces import scan_surface
 from tests.scan.surface_scenes import motion, seen_from, street
 

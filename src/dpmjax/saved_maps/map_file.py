@@ -22,11 +22,11 @@ from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import Arrays, Precision, pack_map, unpack_map
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.keyframe_map import KeyframeMap, MapOrigin, thin_map
 from dpmjax.slam.local_map import PlacedElements
 from dpmjax.slam.loops import Loop, LoopState
 from dpmjax.slam.system import SlamState
+from dpmjax.slam.track import FrontEndState, ScanReport
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3

@@ -23,10 +23,10 @@ from .lidar.corrections import deskew as deskew
 from .lidar.corrections import offsets_by_azimuth as offsets_by_azimuth
 from .lidar.corrections import offsets_by_times as offsets_by_times
 from .lidar.corrections import raise_beams as raise_beams
-from .lidar.correlate import ViewCorrelationConfig as ViewCorrelationConfig
-from .lidar.correlate import correlate_views as correlate_views
 from .lidar.preprocess import PreprocessConfig as PreprocessConfig
 from .lidar.preprocess import preprocess_scan_on_host as preprocess_scan_on_host
+from .lidar.propose import ViewCorrelationConfig as ViewCorrelationConfig
+from .lidar.propose import correlate_views as correlate_views
 from .lidar.record import Scan as Scan
 from .lidar.record import lidar_scan as lidar_scan
 from .lidar.record import measure_scan as measure_scan

@@ -10,7 +10,6 @@ from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .config import slam_preset as slam_preset
-from .front_end import ScanReport as ScanReport
 from .interfaces import Alignment as Alignment
 from .interfaces import Geometry as Geometry
 from .interfaces import Match as Match
@@ -75,5 +74,6 @@ from .system import prepare_ahead as prepare_ahead
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam
 from .system import with_guess as with_guess
+from .track import ScanReport as ScanReport
 from .unposed import RegisteredClouds as RegisteredClouds
 from .unposed import register_unposed as register_unposed

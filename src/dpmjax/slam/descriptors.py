@@ -20,7 +20,6 @@ from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
 from dpmjax.scan.lidar.slide import diagonal_information
 from dpmjax.slam.config import DescriptorConfig
-from dpmjax.slam.front_end import UNKNOWN_M, FrontEndState, RegisteredScan, ScanReport, empty_reason, with_keyframe
 from dpmjax.slam.interfaces import Match, PreparedInput, SlamMethods
 from dpmjax.slam.keyframe_map import (
     SUBMAP_RADIUS_M,
@@ -34,6 +33,7 @@ from dpmjax.slam.keyframe_map import (
     submap_of,
 )
 from dpmjax.slam.loops import DESCRIPTOR_INFORMATION, Loop, LoopState, LoopStatus, move_parts, path_since_loop_m
+from dpmjax.slam.track import UNKNOWN_M, FrontEndState, RegisteredScan, ScanReport, empty_reason, with_keyframe
 from dpmjax.types import Information
 
 # Largest number of edges to a keyframe of a neighbourhood, and of keyframes in it.

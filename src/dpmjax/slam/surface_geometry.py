@@ -9,14 +9,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scan.apart import apart
 from dpmjax.scan.lidar.align import ALL, AlignmentLevel, align_on_host
+from dpmjax.scan.lidar.compare import contradicted_shares, matched_shares
 from dpmjax.scan.lidar.pairs import Pairs, nearest_planes
 from dpmjax.scan.lidar.record import Scan, lidar_scan
 from dpmjax.scan.lidar.slide import plane_information, with_least_covariance, without_noise_along
-from dpmjax.scan.lidar.surfaces import Surface, view_points
 from dpmjax.sequences import homogeneous
 from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap
@@ -104,7 +103,7 @@ class SurfaceGeometry:
             The pose of the highest score: most elements meet planes, and fewest lie in free space.
         """
         coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, WIDE).T_target_source
-        matched = _matched_shares(scan.surface, _planes(local_map, scan, coarse, NUM_SAMPLES // 3))
+        matched = matched_shares(scan.surface, _planes(local_map, scan, coarse, NUM_SAMPLES // 3))
         best = _distinct(coarse[np.argsort(-matched, kind="stable")])
         return max(_aligned(local_map, scan, best), key=lambda found: found.score)
 
@@ -137,7 +136,7 @@ def _aligned(local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
     """Aligns from first guesses that are nearly right, and compares the scan with the map there."""
     T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), NARROW).T_target_source
     planes = _planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
-    matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
+    matched, contradicted = matched_shares(scan.surface, planes), contradicted_shares(local_map.surface, scan, T)
     scores = matched - CONTRADICTION_WEIGHT * contradicted
     columns = (column.tolist() for column in (matched, contradicted, scores))
     information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
@@ -167,27 +166,3 @@ def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
     if scan.weak_axis is not None:
         pairs = without_noise_along(planes, scan.surface, T_map_scan, scan.weak_axis)
     return with_least_covariance(plane_information(pairs, T_map_scan), FLOOR_M, FLOOR_RAD)
-
-
-def _matched_shares(surface: Surface, planes: Pairs) -> Float[np.ndarray, " s"]:
-    """Returns the mean share of elements that meet planes, over the main directions of their normals.
-
-    Ground meets ground under any motion: without the mean it would outweigh the walls.
-    """
-    meets = planes.meets
-    is_along = np.eye(3)[np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)]
-    counts = is_along.sum(axis=0)
-    # A direction of few elements counts less, because its share is uncertain.
-    weights = np.minimum(counts, counts.max() / 3) + 1e-9
-    return np.asarray(meets @ is_along / np.maximum(counts, 1) @ (weights / weights.sum()))
-
-
-def _contradicted_shares(local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Float[np.ndarray, " s"]:
-    """Returns the share of visible elements of the map that lie in the free space of the scan."""
-    surface = local_map.surface
-    # Number of elements of the local map that are compared with the free space of a scan.
-    points = surface.points.take(surface.samples[:4000], axis=0).astype(np.float32)
-    T_scan_map = rigid.inverse(T_map_scan).astype(np.float32)
-    moved = np.matmul(T_scan_map[:, :3, :3], points.T) + T_scan_map[:, :3, 3:]
-    is_visible, is_contradicted = view_points(scan.image, moved.swapaxes(1, 2))
-    return np.asarray(is_contradicted.sum(axis=1) / np.maximum(is_visible.sum(axis=1), 1))

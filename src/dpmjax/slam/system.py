@@ -22,14 +22,14 @@ from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scan.lidar.corrections import deskew
-from dpmjax.slam import descriptors, front_end, loop_closure
+from dpmjax.slam import descriptors, loop_closure, track
 from dpmjax.slam.assess import MapAssessment, assess_map
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph, measured_parts
 from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted, optimize_map
 from dpmjax.slam.model_methods import as_methods
+from dpmjax.slam.track import FrontEndState, ScanReport
 from dpmjax.types import Pose, Poses, with_short_repr
 
 Item = TypeVar("Item")
@@ -54,7 +54,7 @@ def procedure_of(config: SlamConfig) -> SlamProcedure:
     """Returns the steps of the configured method; no other function chooses between the methods."""
     if config.method == "descriptors":
         return SlamProcedure(descriptors.place_scan, descriptors.close_loops, descriptors.join_keyframe)
-    return SlamProcedure(front_end.place_scan, loop_closure.close_loops, loop_closure.join_keyframe)
+    return SlamProcedure(track.place_scan, loop_closure.close_loops, loop_closure.join_keyframe)
 
 
 @with_short_repr

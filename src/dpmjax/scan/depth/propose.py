@@ -32,6 +32,7 @@ from dpmjax.scan.depth.align import (
 )
 from dpmjax.scan.depth.compare import Agreement, both_ways
 from dpmjax.scan.depth.record import Pinhole, PixelSample, Views
+from dpmjax.scan.depth.slide import slide_motions
 from dpmjax.types import AnyArray
 
 # Largest translation between neighbouring images along each axis, metres.
@@ -137,7 +138,8 @@ def propose_motions(
         moves = _motions((0.25 * 0.5**step * widths * noise).reshape(-1, 6))
         T = (best @ moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = search.scores(T, config.tolerances[_NUM_ROUNDS - 1], _NUM_REFERENCES)
-    T = _slid(motions_apart(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
+    lengths = _SLIDE * MAX_TRANSLATION * np.linspace(-1.0, 1.0, _NUM_SLIDES)
+    T = slide_motions(motions_apart(T, scores, _NUM_SLID, _DIFFERENT), view.directions, lengths)
     scores = search.scores(T, config.tolerances[_NUM_ROUNDS], NUM_CHECKED)
     T = motions_apart(T, scores, _NUM_ADJUSTED, _SLID_APART)
     T, scores = search.adjusted(T, config.tolerances[_NUM_ROUNDS:])
@@ -281,35 +283,3 @@ def motions_apart(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares:
 
     kept = apart(scores, is_near, count)
     return T[kept] if len(kept) else T[:1]
-
-
-def _slid(T: Poses, directions: Float[np.ndarray, "a 3"]) -> Poses:
-    """Returns the motions, and each motion shifted along each axis of the image in both directions."""
-    lengths = _SLIDE * MAX_TRANSLATION * np.linspace(-1.0, 1.0, _NUM_SLIDES)
-    shifts = (lengths[:, None, None] * directions).reshape(-1, 3)
-    moves = _motions(np.concatenate([shifts, np.zeros_like(shifts)], axis=1))
-    return np.concatenate([T, (T[:, None] @ moves).reshape(-1, 4, 4)])
-
-
-def slide_margin(images: DepthImages, T_world_camera: Poses, tolerance: float, distance: float) -> tuple[float, float]:
-    """Compares the consistency of the last image with that after shifts along the axes of its surfaces.
-
-    Args:
-        images: n views and their camera.
-        T_world_camera: (n, 4, 4) poses.
-        tolerance: share of the depth by which matching points may differ.
-        distance: of the longer shifts, unit of the points.
-
-    Returns:
-        The consistency of the last image with all others, and by how much it exceeds that after the best shift.
-    """
-    view, T, count = images.views[-1], T_world_camera[-1], len(T_world_camera) - 1
-    shifts = np.concatenate([sign * distance * view.directions for sign in (0.5, -0.5, 1.0, -1.0)])
-    moves = _motions(np.concatenate([shifts, np.zeros_like(shifts)], axis=1))
-    nodes = np.concatenate([T_world_camera, T @ moves])
-    own, other = np.divmod(np.arange((1 + len(moves)) * count), count)
-    pairs = np.stack([np.r_[own + count, other], np.r_[other, own + count]], axis=1)
-    shifted = images._replace(views=[*images.views, *[view] * len(moves)])
-    found = linearise_images(shifted, nodes, pairs, tolerance)
-    scores = group_consistency(found, pairs.max(axis=1) - count, 1 + len(moves))
-    return float(scores[0]), float(scores[0] - scores[1:].max())

@@ -36,10 +36,10 @@ from dpmjax.scan.depth.propose import (
     SEARCH,
     motion_cost,
     propose_motions,
-    slide_margin,
     turns_rad,
 )
 from dpmjax.scan.depth.record import DepthScans
+from dpmjax.scan.depth.slide import slide_margin
 
 # Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)

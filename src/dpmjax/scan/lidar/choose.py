@@ -20,7 +20,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.scan.lidar.align import AlignmentLevel, align_on_host
 from dpmjax.scan.lidar.compare import VerificationConfig, compare_scans, verify_motions
-from dpmjax.scan.lidar.correlate import ViewCorrelationConfig, correlate_views
+from dpmjax.scan.lidar.propose import ViewCorrelationConfig, correlate_views
 from dpmjax.scan.lidar.record import Scan
 from dpmjax.scan.lidar.slide import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Pose, Poses, Verification

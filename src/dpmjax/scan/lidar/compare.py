@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scan.lidar.correlate import ViewCorrelationConfig
-from dpmjax.scan.lidar.pairs import nearest_planes
+from dpmjax.scan.lidar.pairs import Pairs, nearest_planes
+from dpmjax.scan.lidar.propose import ViewCorrelationConfig
 from dpmjax.scan.lidar.record import Scan
-from dpmjax.scan.lidar.surfaces import SurfaceConfig, view_points
+from dpmjax.scan.lidar.surfaces import Surface, SurfaceConfig, view_points
 from dpmjax.types import Poses, Verification
 
 # A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
@@ -173,6 +173,45 @@ def evidence_shares(
         Shares in the order of `EvidenceWeights`, means of both scans.
     """
     return _evidence(_both_sides(source, target, T_target_source, config))
+
+
+def matched_shares(surface: Surface, planes: Pairs) -> Float[np.ndarray, " s"]:
+    """Computes the mean share of elements that meet planes, over the main directions of their normals.
+
+    Ground meets ground under any motion: without the mean it would outweigh the walls.
+
+    Args:
+        surface: surface of a scan.
+        planes: planes nearest to its first samples, under several motions.
+
+    Returns:
+        A share for each motion.
+    """
+    meets = planes.meets
+    is_along = np.eye(3)[np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)]
+    counts = is_along.sum(axis=0)
+    # A direction of few elements counts less, because its share is uncertain.
+    weights = np.minimum(counts, counts.max() / 3) + 1e-9
+    return np.asarray(meets @ is_along / np.maximum(counts, 1) @ (weights / weights.sum()))
+
+
+def contradicted_shares(surface: Surface, scan: Scan, T_surface_scan: Poses) -> Float[np.ndarray, " s"]:
+    """Computes the share of the visible elements of a surface that lie in the free space of a scan.
+
+    Args:
+        surface: the surface, as of a local map.
+        scan: the scan.
+        T_surface_scan: motions of the scan.
+
+    Returns:
+        A share for each motion.
+    """
+    # Number of elements that are compared.
+    points = surface.points.take(surface.samples[:4000], axis=0).astype(np.float32)
+    T_scan_surface = rigid.inverse(T_surface_scan).astype(np.float32)
+    moved = np.matmul(T_scan_surface[:, :3, :3], points.T) + T_scan_surface[:, :3, 3:]
+    is_visible, is_contradicted = view_points(scan.image, moved.swapaxes(1, 2))
+    return np.asarray(is_contradicted.sum(axis=1) / np.maximum(is_visible.sum(axis=1), 1))
 
 
 def _both_sides(

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
-from dpmjax.scan.lidar.correlate import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.scan.lidar.pairs import PLANE_DISTANCE_M, Pairs, nearest_planes
 from dpmjax.scan.lidar.preprocess import first_of_each_voxel
+from dpmjax.scan.lidar.propose import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.scan.lidar.surfaces import MIN_FLATNESS, Surface
 from dpmjax.types import Information, Pose, Poses
 

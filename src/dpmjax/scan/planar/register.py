@@ -1,6 +1,6 @@
 """Registration of two planar scans without a first guess, and the probability that the motion is right.
 
-All turns and shifts are searched (`correlate.py`), the best distinct motions are aligned finely, and the one with the
+All turns and shifts are searched (`propose.py`), the best distinct motions are aligned finely, and the one with the
 best score of the views is kept. Its probability follows from its lead over the best other motion and from its freedom
 to slide.
 """
@@ -15,7 +15,7 @@ from dpmjax.geometry import se2
 from dpmjax.scan.pair_evidence import PairEvidence, PairModel, ScanRegistration
 from dpmjax.scan.planar.align import FINE, match_pairs
 from dpmjax.scan.planar.compare import LEAST_VISIBLE, find_evidence
-from dpmjax.scan.planar.correlate import CorrelativeConfig, poses_apart, search_pairs
+from dpmjax.scan.planar.propose import CorrelativeConfig, poses_apart, search_pairs
 from dpmjax.scan.planar.record import PlanarScans, planar_scans
 from dpmjax.scan.planar.slide import BEAM_DEVIATION, slide_steps
 

@@ -25,8 +25,8 @@ from jaxtyping import Bool
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import label_parts
 from dpmjax.scan.planar.compare import compare_pairs, pair_scores
-from dpmjax.scan.planar.correlate import Hypotheses
 from dpmjax.scan.planar.motion_prior import StepPrior
+from dpmjax.scan.planar.propose import Hypotheses
 from dpmjax.scan.planar.record import Floats, Indices, Pairs, PlanarScans
 from dpmjax.scan.planar.slide import Slides, slid_steps, slide_steps
 

@@ -18,7 +18,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import PoseGraph, join_rows, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.scan.planar.compare import compare_pairs, weak_steps
-from dpmjax.scan.planar.correlate import (
+from dpmjax.scan.planar.propose import (
     CorrelativeConfig,
     Hypotheses,
     chance_level,

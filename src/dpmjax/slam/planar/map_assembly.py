@@ -22,7 +22,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.scan.planar.compare import compare_pairs
-from dpmjax.scan.planar.correlate import Hypotheses, chance_level, noisy_share
+from dpmjax.scan.planar.propose import Hypotheses, chance_level, noisy_share
 from dpmjax.scan.planar.record import Booleans, Floats, Indices, PlanarScans
 
 # A pair agrees with a map within this: translation in typical ranges, radians.

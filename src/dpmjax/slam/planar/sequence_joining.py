@@ -15,8 +15,8 @@ import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.scan.planar.compare import pair_scores, weak_steps
-from dpmjax.scan.planar.correlate import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.scan.planar.motion_prior import MotionPrior
+from dpmjax.scan.planar.propose import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.scan.planar.record import Floats, Indices, PlanarScans, planar_scans, spread_evenly
 from dpmjax.scan.planar.wall_directions import WallDirections
 

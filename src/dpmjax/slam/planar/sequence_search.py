@@ -1,7 +1,7 @@
 """Poses of a sequence of scans by beam search, with several hypotheses for each scan.
 
 If two scans share few beams, several poses of their step fit. An exhaustive search of the pair finds these hypotheses
-(`correlate.py`). It prefers poses with much overlap. So alignments from arcs of the usual motion are further
+(`propose.py`). It prefers poses with much overlap. So alignments from arcs of the usual motion are further
 hypotheses. The score of a hypothesis is matched less contradicting beams against all of the last placed scans. (The
 fitness of an ICP ignores contradicting beams.) The best sequences of poses are kept from scan to scan. A scan that fits
 none of the last placed scans (a swapped line of the log, a covered lens) is not registered, and the sequence continues
@@ -26,8 +26,8 @@ from dpmjax.scan.planar.compare import (
     pair_scores,
     weak_steps,
 )
-from dpmjax.scan.planar.correlate import CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.scan.planar.motion_prior import MotionPrior
+from dpmjax.scan.planar.propose import CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.scan.planar.record import Booleans, Floats, Indices, PlanarScans
 from dpmjax.slam.planar.recordings import distinct_rows, interpolate
 from dpmjax.slam.planar.sequence_joining import join_parts
