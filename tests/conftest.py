@@ -23,6 +23,8 @@ os.environ["XLA_FLAGS"] = " ".join(
 
 # Both workers, and the next run, take programs of the same code from one cache instead of compiling them again.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+# Traced programs are not kept: the types of their arguments are checked where they are traced.
+os.environ.setdefault("DPMJAX_TRACED", "")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dpmjax
 from dpmjax.compile_cache import TRACED_FOLDER
 from dpmjax.kept_programs import KeptProgram, keep_result, prepare_program
 
@@ -91,3 +92,12 @@ def test_nothing_is_kept_without_a_folder(tmp_path: Path, monkeypatch) -> None:
 def test_a_result_is_computed_once_for_each_key(folder: Path) -> None:
     found = [keep_result("name", key, lambda: traced.append("computed") or len(traced)) for key in (1, 1, 2)]
     assert found == [1, 1, 2]
+
+
+def test_programs_of_the_network_are_kept(folder: Path, model) -> None:
+    rng = np.random.default_rng(0)
+    clouds = [dpmjax.encode(model, rng.normal(size=(200, 3)).astype(np.float32)) for _ in range(2)]
+    dpmjax.overlap_pairs(model, clouds[:1], clouds[1:])
+    dpmjax.register(model, *clouds)
+    kept = {path.name.rpartition("-")[0] for path in folder.iterdir()}
+    assert {"deeppointmap.overlap_prediction.overlap_probability", "deeppointmap.registration.trace_match"} <= kept

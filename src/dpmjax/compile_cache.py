@@ -62,12 +62,14 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
 
 @functools.cache
 def keep_programs() -> None:
-    """Switches the cache on where JAX has none yet, and logs where compilation takes long."""
+    """Switches the cache on where JAX has none yet, keeps traced programs, and logs where compilation takes long."""
     import jax
 
     options: Any = jax.config
     if options.jax_compilation_cache_dir is None:
         enable_compile_cache()
+    elif os.environ.get("DPMJAX_CACHE") not in ("0", "off"):  # a cache of the user's own
+        os.environ.setdefault(TRACED_FOLDER, str(Path(options.jax_compilation_cache_dir) / "traced"))
     folder = options.jax_compilation_cache_dir
     later = f"later processes load the programs from {folder}" if folder else "the cache of programs is off"
     jax.monitoring.register_event_duration_secs_listener(announcer(later))

@@ -12,6 +12,7 @@ import contextlib
 import functools
 import hashlib
 import inspect
+import logging
 import os
 import pickle
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from jax import export
 from dpmjax.compile_cache import TRACED_FOLDER
 
 Result = TypeVar("Result")
+_log = logging.getLogger(__name__)
 
 
 # A program on flat arrays, and the structure of its result.
@@ -100,7 +102,8 @@ class KeptProgram:
         try:
             result, program = keep_result(self._name, (static, tree, shapes, jax.default_backend()), trace)
             return jax.jit(export.deserialize(program).call), result
-        except Exception:
+        except Exception as error:
+            _log.info("%s is traced by each process: %s", self._name, error)
             return None
 
 

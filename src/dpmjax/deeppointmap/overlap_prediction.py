@@ -119,7 +119,7 @@ def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequen
     return jnp.stack(_apply_to_pairs(overlap_evidence, model, sources, targets), axis=1)
 
 
-@jax.jit
+@kept_jit()
 def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> OverlapEvidence:
     """Matches two clouds and computes the features of their overlap probability.
 
@@ -155,7 +155,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
     )
 
 
-@jax.jit
+@kept_jit()
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Predicts the probability that two clouds are less than 20 m apart, by the regression or else by the head.
 
@@ -204,7 +204,7 @@ def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud
 
 
 def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
-    """Applies a function of one pair to all pairs; each scan is encoded once."""
+    """Applies a compiled function of one pair to all pairs; each scan is encoded once."""
     require_pairs(sources, targets)
     scans: dict[int, Any] = {id(scan): scan for scan in (*sources, *targets)}
     raw = {key: scan for key, scan in scans.items() if not isinstance(scan, DescriptorCloud | Scan)}
@@ -215,14 +215,8 @@ def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud],
         [descriptors_of(scans[id(scan)]).described for scan in pair] for pair in zip(sources, targets, strict=True)
     ]
     # One by one: a pair takes a CPU 24 ms, and most calls of SLAM have one or two.
-    results = jax.device_get([_apply_to_pair(function, model, *pair) for pair in pairs])
+    results = jax.device_get([function(model, *pair) for pair in pairs])
     return jax.tree.map(lambda *values: np.stack(values), *results)
-
-
-@kept_jit("function")
-def _apply_to_pair(function: Any, model: Model, source: DescriptorCloud, target: DescriptorCloud) -> Any:
-    """Applies a function of one pair in a compiled program."""
-    return function(model, source, target)
 
 
 def _best_motion(

@@ -135,7 +135,7 @@ def step_to_planes(
     counted = (weights > 0).astype(points.dtype)
     count = xp.maximum(counted.sum(axis=-1), 1)[..., None]
     centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
-    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
+    jacobian = xp.concatenate([xp.swapaxes(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
     weighted = weights[..., None, :] * jacobian
     system, gradient = (
         rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2)),

@@ -20,7 +20,11 @@ SERIES_BELOW = 0.1
 
 def namespace_of(*arrays: Any) -> ModuleType:
     """Returns `jax.numpy` if one array or more is JAX's, else `numpy`."""
-    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+    for array in arrays:
+        # A question to `jax.Array` takes longer than most operations on a pose.
+        if type(array) is not np.ndarray and isinstance(array, jax.Array):
+            return jnp
+    return np
 
 
 def matmul(a: Any, b: Any) -> Any:
