@@ -57,7 +57,8 @@ def test_the_motion_is_found_from_any_shift_and_half_turn(with_pillars, distance
     assert found.T_target_source[:3, 0] @ T_TRUE[:3, 0] > 0.99
     assert found.verification.facing_gap > 0
     refined = refine_motion(*with_pillars, found, CONFIG)
-    assert refined.verification.facing_gap == found.verification.facing_gap
+    assert refined.verification[7:] == found.verification[7:]
+    assert 0 < found.verification.distinct_gap <= found.verification.facing_gap
 
 
 def test_a_bare_corridor_is_never_sure_of_the_shift(bare, with_pillars) -> None:
@@ -102,8 +103,8 @@ def test_a_lead_that_other_niches_have_too_is_not_sure() -> None:
         conf.LogisticModel(conf.SCAN_FEATURES, (0.0,) * 9, 0.0),
         sure,
     )
-    for lead, expected in ((39.0, conf.CORRIDOR_CONFIDENCE), (41.0, 1.0)):
-        scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=lead)
+    for lead, expected in ((9.0, conf.CORRIDOR_CONFIDENCE), (11.0, 1.0)):
+        scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=41.0, distinct_gap=lead)
         found = evidence_of(None, scans=scans, num_pairs=1)
         assert conf.calibrated_probability(calibration, found) == pytest.approx(expected)
 
