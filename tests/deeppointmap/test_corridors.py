@@ -65,7 +65,10 @@ def test_a_bare_corridor_is_never_sure_of_the_shift(bare, with_pillars) -> None:
     found = choose_motion(*bare, T_TRUE[None], CONFIG)
     assert found.verification.num_slid > 0
     assert confidence(found) < 0.5
-    assert confidence(choose_motion(*with_pillars, T_TRUE[None], CONFIG)) > 0.9
+    assert found.verification.distinct_gap < 1
+    among_pillars = choose_motion(*with_pillars, T_TRUE[None], CONFIG)
+    assert confidence(among_pillars) > 0.9
+    assert among_pillars.verification.distinct_gap > 2 * conf.CLEAR_DISTINCT_GAP
 
 
 def elements_of(scan: Scan) -> Scan:
@@ -128,8 +131,9 @@ def evidence_of(elements: Verification | None, num_elements: int = 1024, *, scan
 
 @pytest.mark.slow
 def test_pillars_at_equal_steps_leave_the_shift_open() -> None:
-    scans = scans_of(tuple(np.arange(-58.0, 58.0, 4.0)))
-    assert confidence(choose_motion(*scans, T_TRUE[None], CONFIG)) < 0.9
+    found = choose_motion(*scans_of(tuple(np.arange(-58.0, 58.0, 4.0))), T_TRUE[None], CONFIG)
+    assert confidence(found) < 0.9
+    assert found.verification.distinct_gap < 1
 
 
 def test_the_weak_direction_is_the_axis_of_the_corridor(bare) -> None:
