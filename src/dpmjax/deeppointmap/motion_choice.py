@@ -191,7 +191,8 @@ class _Pair(NamedTuple):
     def facing_elements(self, axes: Sequence[WallAxis], T_target_source: Poses) -> Float[np.ndarray, "2 s"]:
         """Counts elements that face the weak axis and meet; those in free space and unmet visible ones are deducted.
 
-        The second row is the share of visible ones that meet, of the scan with the smaller share.
+        Returns:
+            The counts; and the shares of visible ones that meet, each of the scan with the smaller share.
         """
         settings, counts, shares = replace(self.config, num_samples=NUM_FACING), [], []
         scans, motions = (self.source, self.target), (T_target_source, rigid.inverse(T_target_source))
