@@ -116,7 +116,7 @@ def list_places() -> list[cli.Row]:
 
 def open_place(place: int, kind: str, beams: int) -> LidarSequence:
     """Simulates a town, or an ambiguous place in its true size."""
-    if kind not in AMBIGUOUS:
+    if not beams:
         return simulation.simulate_drive(place, length_m=TOWN_LENGTH_M, kind=kind)
     true_size = simulation.SceneMixture(indoor_scale=(1.0, 1.0))
     return simulation.simulate_drive(place, length_m=TOWN_LENGTH_M, kind=kind, sensor=BEAMS[beams], mixture=true_size)
@@ -127,7 +127,7 @@ def measure_places(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
 
     @lru_cache(maxsize=1)
     def read(place: int, kind: str, beams: int) -> list[dpm.ScanPair]:
-        bands = AMBIGUOUS_BANDS_M if kind in AMBIGUOUS else TOWN_BANDS_M
+        bands = AMBIGUOUS_BANDS_M if beams else TOWN_BANDS_M
         return list(dpm.draw_calibration_pairs(open_place(place, kind, beams), bands, NUM_PAIRS, seed))
 
     def work(place: int, kind: str, beams: int, pair: int) -> cli.Row:
@@ -135,7 +135,7 @@ def measure_places(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
         if pair >= len(pairs):
             return {}
         row = dpm.measure_pair(model, pairs[pair])
-        return row | {"is_end": kind in AMBIGUOUS and row["distance_m"] >= dpm.FAR_M}
+        return row | {"is_end": beams > 0 and row["distance_m"] >= dpm.FAR_M}
 
     numbers = range(NUM_PAIRS * len(TOWN_BANDS_M))
     cases = [{**place, "pair": number} for place in list_places() for number in numbers]

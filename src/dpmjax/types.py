@@ -182,6 +182,9 @@ class Verification(NamedTuple):
         num_slid: number of further motions along a weak axis; 0 where the walls constrain all directions.
         facing_gap: lead over the best other motion, or over 0, in elements that face the weak axis: those that meet,
             less a penalty of those that contradict. It is 0 where no axis is weak.
+        distinct_gap: `facing_gap`, times its share of the count of this motion, times the share of the visible elements
+            facing the axis that meet. Places with like niches have many elements in common, but fewer than all, or the
+            next niche has as many.
         lookalike_gap: lead of `score` over the best motion to any other place, those where the scans look alike from
             above among them; infinite where none of these was tried.
     """
@@ -194,6 +197,7 @@ class Verification(NamedTuple):
     num_tried: int = 1
     num_slid: int = 0
     facing_gap: float = 0.0
+    distinct_gap: float = 0.0
     lookalike_gap: float = math.inf
 
 

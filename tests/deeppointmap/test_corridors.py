@@ -57,14 +57,18 @@ def test_the_motion_is_found_from_any_shift_and_half_turn(with_pillars, distance
     assert found.T_target_source[:3, 0] @ T_TRUE[:3, 0] > 0.99
     assert found.verification.facing_gap > 0
     refined = refine_motion(*with_pillars, found, CONFIG)
-    assert refined.verification.facing_gap == found.verification.facing_gap
+    assert refined.verification[7:] == found.verification[7:]
+    assert 0 < found.verification.distinct_gap <= found.verification.facing_gap
 
 
 def test_a_bare_corridor_is_never_sure_of_the_shift(bare, with_pillars) -> None:
     found = choose_motion(*bare, T_TRUE[None], CONFIG)
     assert found.verification.num_slid > 0
     assert confidence(found) < 0.5
-    assert confidence(choose_motion(*with_pillars, T_TRUE[None], CONFIG)) > 0.9
+    assert found.verification.distinct_gap < 1
+    among_pillars = choose_motion(*with_pillars, T_TRUE[None], CONFIG)
+    assert confidence(among_pillars) > 0.9
+    assert among_pillars.verification.distinct_gap > 2 * conf.CLEAR_DISTINCT_GAP
 
 
 def elements_of(scan: Scan) -> Scan:
@@ -102,8 +106,8 @@ def test_a_lead_that_other_niches_have_too_is_not_sure() -> None:
         conf.LogisticModel(conf.SCAN_FEATURES, (0.0,) * 9, 0.0),
         sure,
     )
-    for lead, expected in ((39.0, conf.CORRIDOR_CONFIDENCE), (41.0, 1.0)):
-        scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=lead)
+    for lead, expected in ((9.0, conf.CORRIDOR_CONFIDENCE), (11.0, 1.0)):
+        scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=41.0, distinct_gap=lead)
         found = evidence_of(None, scans=scans, num_pairs=1)
         assert conf.calibrated_probability(calibration, found) == pytest.approx(expected)
 
@@ -127,8 +131,9 @@ def evidence_of(elements: Verification | None, num_elements: int = 1024, *, scan
 
 @pytest.mark.slow
 def test_pillars_at_equal_steps_leave_the_shift_open() -> None:
-    scans = scans_of(tuple(np.arange(-58.0, 58.0, 4.0)))
-    assert confidence(choose_motion(*scans, T_TRUE[None], CONFIG)) < 0.9
+    found = choose_motion(*scans_of(tuple(np.arange(-58.0, 58.0, 4.0))), T_TRUE[None], CONFIG)
+    assert confidence(found) < 0.9
+    assert found.verification.distinct_gap < 1
 
 
 def test_the_weak_direction_is_the_axis_of_the_corridor(bare) -> None:

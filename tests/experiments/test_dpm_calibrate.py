@@ -44,6 +44,13 @@ def kinds(monkeypatch) -> list[str | None]:
     return kinds
 
 
+def test_every_place_opens(kinds) -> None:
+    places = dpm_calibrate.list_places()
+    for place in places:
+        dpm_calibrate.open_place(**place)
+    assert kinds == [place["kind"] for place in places]
+
+
 @pytest.mark.slow
 def test_calibration_is_stored_in_a_copy_of_the_model_and_resumes(weights, kinds, tmp_path, monkeypatch) -> None:
     sizes = {"NUM_PAIRS": 20, "NUM_OVERLAP_PAIRS": 16, "NUM_TOWNS": 3, "NUM_AMBIGUOUS": 2, "NUM_OVERLAP_TOWNS": 2}

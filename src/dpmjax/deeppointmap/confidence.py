@@ -6,7 +6,6 @@ fitted by `python -m experiments.dpm_calibrate` and stored in the configuration 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -27,9 +26,9 @@ SCAN_FEATURES = (
 )
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
-# Niches and pillars at equal steps repeat at other places, which lead by up to 39 elements (simulated tunnels, 56 to
-# 157 m off). Two scans a few metres apart have a lead of 38 to 146.
-CLEAR_FACING_GAP = 40.0
+# Niches and pillars at equal steps repeat at other places. Of 118 wrong motions of simulated corridors and tunnels none
+# has a larger `distinct_gap` than 7.5; of 91 right ones 37 have more than this limit.
+CLEAR_DISTINCT_GAP = 10.0
 # Fewer elements see and meet less of each other than those of the fit.
 MIN_NUM_ELEMENTS = 512
 # Few elements of a cloud face an axis; more of them say no more.
@@ -126,8 +125,8 @@ class MatchEvidence(NamedTuple):
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
         of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
-        lookalike_gap: lead over other places, as log odds; infinite where none looks alike. For surface elements it is
-            that of `CORRIDOR_CONFIDENCE` in corridors.
+        lookalike_gap: lead over other places, as log odds; infinite where none looks alike. In corridors it is that of
+            `CORRIDOR_CONFIDENCE`, for scans only if the lead in the elements that face the axis is not clear.
         of_elements: `ELEMENT_FEATURES`; None without 512 surface elements that were compared.
     """
 
@@ -177,8 +176,10 @@ def gather_evidence(
         return MatchEvidence(of_clouds, None)
     of_verification = verification[: verification._fields.index("num_tried")]
     of_scans = np.array([support, mean_score, rmse_m, gap, *of_verification])
-    of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
-    return MatchEvidence(of_clouds, of_scans, of_weak_scans, verification.lookalike_gap)
+    if verification.num_slid == 0:
+        return MatchEvidence(of_clouds, of_scans, None, verification.lookalike_gap)
+    limit = 1.0 if verification.distinct_gap >= CLEAR_DISTINCT_GAP else CORRIDOR_CONFIDENCE
+    return MatchEvidence(of_clouds, of_scans, weak_features(verification), logit(limit))
 
 
 def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
@@ -208,8 +209,7 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     kind = next(fitting)
     probability = logistic_probability(getattr(calibration, kind), getattr(evidence, kind))
     if kind == "of_weak_scans":
-        is_clear = getattr(evidence, kind)[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
-        return float(probability if is_clear else np.minimum(probability, CORRIDOR_CONFIDENCE))
+        return float(np.minimum(probability, expit(evidence.lookalike_gap)))
     # One of two places under which the scans agree is right; the odds are those of their scores.
     return float(expit(evidence.lookalike_gap) * probability)
 

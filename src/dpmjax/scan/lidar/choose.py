@@ -74,7 +74,7 @@ UNSUPPORTED = repeat(None)
 DISTINCT_M, DISTINCT_RAD = 2.0, math.radians(5.0)
 
 # Fields of `Verification` that rest on all motions that were tried.
-OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap", "lookalike_gap")
+OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap", "distinct_gap", "lookalike_gap")
 
 
 class VerifiedMotion(NamedTuple):
@@ -118,17 +118,16 @@ def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: Ve
     finalists, remaining = pair.refined(tried[:NUM_FINE]), tried[NUM_FINE:]
     lookalikes = pair.refined(lookalikes[:NUM_FINE])
     axes = wall_axis(source.surface), wall_axis(target.surface)
-    num_slid = 0
-    if is_weak := weak_share(*axes) < config.max_weak_share:
-        starts = sliding_motions(*axes, SLIDING_STEP_M)
-        num_slid = len(starts)
+    is_weak = weak_share(*axes) < config.max_weak_share
+    starts = sliding_motions(*axes, SLIDING_STEP_M) if is_weak else hypotheses[:0]
+    if is_weak:
         slid = align_on_host(source.surface, target.surface, starts, COARSE).T_target_source
-        order = np.argsort(-pair.facing_elements(axes, slid), kind="stable")
+        order = np.argsort(-pair.facing_elements(axes, slid)[0], kind="stable")
         finalists += pair.aligned(UNSUPPORTED, slid[order[:NUM_SLID_FINE]], FINE)
     motions = [*lookalikes, *finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
-    facing = pair.facing_elements(axes, T) if is_weak else np.zeros(len(motions))
+    facing, met_share = pair.facing_elements(axes, T) if is_weak else np.zeros((2, len(motions)))
     best = int(np.argmax((facing if is_weak else scores)[: len(lookalikes) + len(finalists)]))
     chosen, is_other = motions[best], _is_apart(T, T[best])
     if chosen.row is None:
@@ -139,8 +138,9 @@ def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: Ve
     lookalike_gap = float(scores[best] - scores[is_other].max(initial=-np.inf)) if is_compared else np.inf
     is_other[: len(lookalikes)] = False
     gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
-    found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid)
-    return chosen._replace(verification=found._replace(facing_gap=facing_gap, lookalike_gap=lookalike_gap))
+    distinct_gap = float(facing_gap * max(facing_gap, 0.0) / max(facing[best], 1.0) * met_share[best])
+    found = chosen.verification._replace(facing_gap=facing_gap, distinct_gap=distinct_gap, lookalike_gap=lookalike_gap)
+    return chosen._replace(verification=found._replace(gap=gap, num_tried=len(tried), num_slid=len(starts)))
 
 
 def _best_first(motions: list[VerifiedMotion]) -> list[VerifiedMotion]:
@@ -188,16 +188,22 @@ class _Pair(NamedTuple):
         verified = verify_motions(self.source, self.target, T, self.config)
         return list(map(VerifiedMotion, rows, T, verified))
 
-    def facing_elements(self, axes: Sequence[WallAxis], T_target_source: Poses) -> Float[np.ndarray, " s"]:
-        """Counts elements that face the weak axis and meet; those in free space and unmet visible ones are deducted."""
-        settings, counts = replace(self.config, num_samples=NUM_FACING), []
+    def facing_elements(self, axes: Sequence[WallAxis], T_target_source: Poses) -> Float[np.ndarray, "2 s"]:
+        """Counts elements that face the weak axis and meet; those in free space and unmet visible ones are deducted.
+
+        Returns:
+            The counts; and the shares of visible ones that meet, each of the scan with the smaller share.
+        """
+        settings, counts, shares = replace(self.config, num_samples=NUM_FACING), [], []
         scans, motions = (self.source, self.target), (T_target_source, rigid.inverse(T_target_source))
         for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
             surface, weights = facing_samples(scan.surface, axis.axis, MAX_FACING)
             side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
             values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
-            counts.append(values @ weights[:NUM_FACING])
-        return np.mean(counts, axis=0)
+            weights = weights[:NUM_FACING]
+            counts.append(values @ weights)
+            shares.append((side.meets & side.is_visible) @ weights / np.maximum(side.is_visible @ weights, 1.0))
+        return np.stack([np.mean(counts, axis=0), np.min(shares, axis=0)])
 
 
 def refine_motion(source: Scan, target: Scan, motion: VerifiedMotion, config: VerificationConfig) -> VerifiedMotion:
@@ -240,10 +246,10 @@ def verify_elements(source: Scan, target: Scan, T_target_source: Pose, config: V
         return found
     starts = sliding_motions(*axes, SLIDING_STEP_M)
     num_slid = len(starts)
-    order = np.argsort(-pair.facing_elements(axes, starts), kind="stable")
+    order = np.argsort(-pair.facing_elements(axes, starts)[0], kind="stable")
     starts = starts[order[:NUM_SLID_ELEMENTS]]
     slid = align_on_host(source.surface, target.surface, starts, OF_ELEMENTS).T_target_source
-    own, *facing = pair.facing_elements(axes, np.concatenate([T, slid]))
+    own, *facing = pair.facing_elements(axes, np.concatenate([T, slid]))[0]
     best = np.array(facing)[_is_apart(slid, T_target_source)].max(initial=0.0)
     return found._replace(num_slid=num_slid, facing_gap=float(own - best))
 
