@@ -28,7 +28,7 @@ from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.pair_search import Hypotheses
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs, pair_scores
-from dpmjax.registration2d.steps import Slides, slid_steps, slide_steps
+from dpmjax.registration2d.steps import Slides, shifts_across, slid_steps, slide_steps
 
 # Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
 # walls in the cells changes the code length by some percent.
@@ -280,7 +280,7 @@ def assess_trajectory(
         lost = np.convolve(is_alone, np.ones(_MAX_ALONE + 1))
         is_whole &= bool(lost.max(initial=0.0) <= _MAX_ALONE)
     steps = None if prior is None else slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
-    deviations = _deviations(scans, len(poses), pairs, steps)
+    deviations = _deviations(scans, poses, pairs, steps)
     if steps is not None:
         later = np.arange(1, len(poses))
         is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & ~is_alone[later] & ~is_alone[later - 1]
@@ -314,12 +314,13 @@ def _turns_freely(scans: PlanarScans) -> Bool[np.ndarray, " n"]:
     return (left < _LEAST_TURN) & (num[:, 0, 0] > 1)
 
 
-def _deviations(scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Slides | None) -> Floats:
+def _deviations(scans: PlanarScans, poses: Floats, pairs: Hypotheses, steps: Slides | None) -> Floats:
     """Returns the standard deviation (n,) of each scan's position relative to the largest fully constrained part.
 
     A pair is closed where its shift along the weak direction is constrained. Other pairs enter with the variance of
-    this shift. These variances, and those of the n - 1 steps with a prior, are the resistances of a network. The
-    variance of a scan is the resistance between the scan and that part, infinite where they are not connected.
+    this shift. These variances, those of the n - 1 steps with a prior, and those of all pairs across an open step
+    together are the resistances of a network. The variance of a scan is the resistance between the scan and that part,
+    infinite where they are not connected.
     """
     slides = slide_steps(scans, pairs.poses, pairs=(pairs.source, pairs.target))
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
@@ -332,10 +333,16 @@ def _deviations(scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Sl
         source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
         information = np.concatenate([information, steps.information()[rows]])
     is_closed = np.isinf(information)
-    label = label_parts(num_scans, source[is_closed], target[is_closed])
+    label = label_parts(len(poses), source[is_closed], target[is_closed])
+    source, target, information = source[~is_closed], target[~is_closed], information[~is_closed]
+    rows = np.flatnonzero(label[1:] != label[:-1])
+    if scans.is_ordered and len(rows):
+        means, spreads = shifts_across(scans, poses, rows)
+        source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
+        information = np.concatenate([information, slides.above_flat(np.hypot(means, spreads))])
     # A closed part moves as one.
     network = np.zeros((label.max() + 1, label.max() + 1))
-    np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
+    np.add.at(network, (label[source], label[target]), -information)
     network += network.T
     ground = np.bincount(label).argmax()
     part = label_parts(len(network), *np.nonzero(network))

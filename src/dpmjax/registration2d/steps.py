@@ -12,6 +12,7 @@ directions.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, take_rows
 from dpmjax.registration2d.motion_prior import StepPrior, usual_steps
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence, pair_scores
 
 # Score above which a step is clear at final poses.
@@ -42,6 +43,9 @@ _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # A step is open where its standard deviation along the weak direction, by the scores alone, is above this, in typical
 # ranges.
 _OPEN_DEVIATION = 0.02
+# Least cosine between the weak direction and the normal of a surface that faces it. Pairs of scans farther apart in
+# time, of a lower score, or with less parallel weak directions, say nothing about a step between them.
+_FACING, _MOST_APART, _LEAST_SCORE, _PARALLEL = 0.5, 12, 0.1, 0.97
 # Least standard deviation of a constrained step, typical ranges and radians.
 _LEAST_DEVIATION = 0.005
 
@@ -87,12 +91,13 @@ class Slides(NamedTuple):
         return np.concatenate([steps[:, :2] + self.shifts[:, None] * self.directions, steps[:, 2:]], axis=1)
 
     def information(self) -> Floats:
-        """Returns inverse variances (k,) along the weak directions, infinite for steps that are not open.
+        """Returns inverse variances (k,) along the weak directions, infinite for steps that are not open."""
+        return np.where(self.is_open, self.above_flat(self.deviations), np.inf)
 
-        The information of a uniform posterior over the reach is subtracted, so flat scores give 0.
-        """
+    def above_flat(self, deviations: Floats) -> Floats:
+        """Returns inverse variances (k,), less that of a uniform posterior over the reach: flat scores give 0."""
         flat = 3.0 / (_REACH * self.typical_range) ** 2
-        return np.where(self.is_open, np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0), np.inf)
+        return np.maximum(np.maximum(deviations, 1e-9) ** -2.0 - flat, 0.0)
 
     def constrained_deviations(self) -> Floats:
         """Returns the standard deviations (k,), at least that of a constrained step."""
@@ -199,6 +204,45 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     probability /= probability.sum(axis=1, keepdims=True)
     means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
+
+
+def shifts_across(scans: PlanarScans, poses: Floats, rows: Indices) -> tuple[Floats, Floats]:
+    """Computes how far the scans after a step are shifted against those before it, by all pairs across the step.
+
+    In a passage most beams hit its sides, which fit at every shift, and a little better at short ones. So only hits on
+    surfaces across the weak direction are compared. A single pair has few of them.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) T_world_scan.
+        rows: (k,) steps, each by its earlier scan.
+
+    Returns:
+        (k,) means of the shifts along the weak direction, and their standard deviations about the mode.
+    """
+    unit, count = scans.typical_range, round(_REACH / _SPACING)
+    shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
+    weak, number = weak_directions(scans), np.append(0, np.cumsum(np.isin(np.arange(len(scans) - 1), rows)))
+    target, apart = (x.ravel() for x in np.meshgrid(np.arange(len(scans)), np.arange(1, _MOST_APART + 1)))
+    target, source = target[target + apart < len(scans)], (target + apart)[target + apart < len(scans)]
+    relative = np.asarray(se2.relative(poses[target], poses[source]), np.float64)
+    is_used = number[source] > number[target]
+    is_used[is_used] = pair_scores(scans, source[is_used], target[is_used], relative[is_used]) > _LEAST_SCORE
+    source, target = source[is_used], target[is_used]
+    places = np.repeat(relative[is_used][:, None], len(shifts), axis=1)
+    places[..., :2] += shifts[:, None] * weak[target][:, None]
+    facing = replace(scans, hits=np.abs(np.einsum("nbi,ni->nb", scans.normals, weak)) > _FACING)
+    nats = find_evidence(facing, source, target, places)[0] / (_SCORE_SCALE * (1.0 + LEAST_VISIBLE))
+    directions, sums = np.einsum("nij,nj->ni", se2.rotation(poses[:, 2]), weak), np.zeros((len(rows), len(shifts)))
+    for total, row in zip(sums, rows, strict=True):
+        cosines = directions[target] @ directions[row]
+        across = np.flatnonzero((target <= row) & (source > row) & (np.abs(cosines) > _PARALLEL))
+        if len(across):
+            # Pairs share scans: together they count as one pair of each scan.
+            weight = len(np.unique(np.concatenate([source[across], target[across]]))) / 2
+            turned = np.where(cosines[across, None] > 0, nats[across], nats[across, ::-1])
+            total[:] = weight * turned.mean(axis=0)
+    return _spread(_interpolated(sums), _interpolated(shifts))
 
 
 def slid_steps(scans: PlanarScans, poses: Floats) -> Slides:
