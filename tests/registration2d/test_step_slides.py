@@ -17,7 +17,7 @@ from dpmjax.registration2d.joint_alignment import restore_torn
 from dpmjax.registration2d.motion_prior import StepPrior
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.refinement import put_back_slid
-from dpmjax.registration2d.steps import slide_steps
+from dpmjax.registration2d.steps import slide_parts, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.
@@ -37,7 +37,7 @@ def scans(truth) -> PlanarScans:
     return scans_of(truth)
 
 
-def scans_of(truth: np.ndarray, niches: tuple[int, ...] = ()) -> PlanarScans:
+def scans_of(truth: np.ndarray, niches: tuple[int, ...] = (), reach_px: float = REACH_PX) -> PlanarScans:
     solid = np.ones((200, 700), bool)
     solid[85:115, 20:680] = False
     for left, right in ((20, 140), (560, 680)):
@@ -46,7 +46,7 @@ def scans_of(truth: np.ndarray, niches: tuple[int, ...] = ()) -> PlanarScans:
     for left in niches:
         solid[81:85, left : left + 12] = False
     points, mask = scan_world(
-        solid, truth, max_range=REACH_PX, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
+        solid, truth, max_range=reach_px, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
     )
     return planar_scans(points * mask[..., None], mask)
 
@@ -148,6 +148,24 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
     torn = assess_trajectory(scans, torn_in_the_corridor(truth, 18.0), prior=prior)
     assert not torn.is_trusted
     assert {10, 11} <= set(torn.uncertain_scans)
+
+
+@pytest.mark.slow
+def test_the_ends_of_a_corridor_constrain_its_length(scans, truth) -> None:
+    """Few beams of each scan reach a wall across the corridor, but those of all pairs across a step agree."""
+    far = scans_of(truth, reach_px=600.0)
+    assert assess_trajectory(far, truth).is_trusted
+    parts = slide_parts(far, truth)
+    assert not parts.is_torn.any()
+    assert (parts.deviations < 0.02 * far.typical_range).all()
+    for factor in (0.9, 1.1):
+        steps = steps_of(truth)
+        steps[IN_CORRIDOR, 0] *= factor
+        found = assess_trajectory(far, se2.chain(steps))
+        assert not found.is_trusted
+        assert found.uncertain_scans
+    # Where no beam reaches an end, nothing does.
+    assert (slide_parts(scans, truth).deviations[9:13] > 0.05 * scans.typical_range).all()
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:

@@ -22,7 +22,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, take_rows
 from dpmjax.registration2d.motion_prior import StepPrior, usual_steps
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence, pair_scores
 
 # Score above which a step is clear at final poses.
@@ -92,12 +92,12 @@ class Slides(NamedTuple):
 
     def information(self) -> Floats:
         """Returns inverse variances (k,) along the weak directions, infinite for steps that are not open."""
-        return np.where(self.is_open, self.above_flat(self.deviations), np.inf)
+        return np.where(self.is_open, self.above_flat(), np.inf)
 
-    def above_flat(self, deviations: Floats) -> Floats:
+    def above_flat(self) -> Floats:
         """Returns inverse variances (k,), less that of a uniform posterior over the reach: flat scores give 0."""
         flat = 3.0 / (_REACH * self.typical_range) ** 2
-        return np.maximum(np.maximum(deviations, 1e-9) ** -2.0 - flat, 0.0)
+        return np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0)
 
     def constrained_deviations(self) -> Floats:
         """Returns the standard deviations (k,), at least that of a constrained step."""
@@ -139,17 +139,14 @@ def slide_steps(
     source, target = pairs or (np.arange(1, len(scans)), np.arange(len(scans) - 1))
     directions = weak_directions(scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
-    places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
-    places[..., :2] += shifts[:, None] * directions[:, None]
+    places = _shifted(steps, directions, shifts)
     costs = np.zeros(places.shape[:2]) if prior is None else prior.costs(places)
     scores = _slide_scores(scans, (source, target), places, costs)
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
     if prior is not None:
-        places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
-        places[..., :2] += shifts[:, None] * directions[:, None]
-        nats -= prior.costs(places)
+        nats -= prior.costs(_shifted(steps, directions, shifts))
     row, best = np.arange(len(steps)), nats.argmax(axis=1)
     is_torn = (nats[row, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
     means, deviations = _spread(nats, shifts)
@@ -206,8 +203,8 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
 
 
-def shifts_across(scans: PlanarScans, poses: Floats, rows: Indices) -> tuple[Floats, Floats]:
-    """Computes how far the scans after a step are shifted against those before it, by all pairs across the step.
+def slide_parts(scans: PlanarScans, poses: Floats, prior: StepPrior | None = None) -> Slides:
+    """Computes the posterior of shifts of all scans after each step against those before it, by pairs across the step.
 
     In a passage most beams hit its sides, which fit at every shift, and a little better at short ones. So only hits on
     surfaces across the weak direction are compared. A single pair has few of them.
@@ -215,34 +212,43 @@ def shifts_across(scans: PlanarScans, poses: Floats, rows: Indices) -> tuple[Flo
     Args:
         scans: n scans in time order.
         poses: (n, 3) T_world_scan.
-        rows: (k,) steps, each by its earlier scan.
+        prior: of the n - 1 steps; None: the scores alone. It decides on torn steps only.
 
     Returns:
-        (k,) means of the shifts along the weak direction, and their standard deviations about the mode.
+        Slides of the n - 1 steps, with mean shifts; `deviations` are those about zero, by the scores alone.
     """
-    unit, count = scans.typical_range, round(_REACH / _SPACING)
+    unit, count, steps = scans.typical_range, round(_REACH / _SPACING), np.arange(len(scans) - 1)
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
-    weak, number = weak_directions(scans), np.append(0, np.cumsum(np.isin(np.arange(len(scans) - 1), rows)))
-    target, apart = (x.ravel() for x in np.meshgrid(np.arange(len(scans)), np.arange(1, _MOST_APART + 1)))
+    target, apart = (x.ravel() for x in np.meshgrid(steps, np.arange(1, _MOST_APART + 1)))
     target, source = target[target + apart < len(scans)], (target + apart)[target + apart < len(scans)]
     relative = np.asarray(se2.relative(poses[target], poses[source]), np.float64)
-    is_used = number[source] > number[target]
-    is_used[is_used] = pair_scores(scans, source[is_used], target[is_used], relative[is_used]) > _LEAST_SCORE
-    source, target = source[is_used], target[is_used]
-    places = np.repeat(relative[is_used][:, None], len(shifts), axis=1)
-    places[..., :2] += shifts[:, None] * weak[target][:, None]
+    fits = pair_scores(scans, source, target, relative) > _LEAST_SCORE
+    source, target, weak = source[fits], target[fits], weak_directions(scans)
     facing = replace(scans, hits=np.abs(np.einsum("nbi,ni->nb", scans.normals, weak)) > _FACING)
-    nats = find_evidence(facing, source, target, places)[0] / (_SCORE_SCALE * (1.0 + LEAST_VISIBLE))
-    directions, sums = np.einsum("nij,nj->ni", se2.rotation(poses[:, 2]), weak), np.zeros((len(rows), len(shifts)))
-    for total, row in zip(sums, rows, strict=True):
-        cosines = directions[target] @ directions[row]
-        across = np.flatnonzero((target <= row) & (source > row) & (np.abs(cosines) > _PARALLEL))
+    agreement, _ = find_evidence(facing, source, target, _shifted(relative[fits], weak[target], shifts))
+    directions, nats = np.einsum("nij,nj->ni", se2.rotation(poses[:, 2]), weak), np.zeros((len(steps), len(shifts)))
+    for step in steps:
+        cosines = directions[target] @ directions[step]
+        across = np.flatnonzero((target <= step) & (source > step) & (np.abs(cosines) > _PARALLEL))
         if len(across):
             # Pairs share scans: together they count as one pair of each scan.
             weight = len(np.unique(np.concatenate([source[across], target[across]]))) / 2
-            turned = np.where(cosines[across, None] > 0, nats[across], nats[across, ::-1])
-            total[:] = weight * turned.mean(axis=0)
-    return _spread(_interpolated(sums), _interpolated(shifts))
+            turned = np.where(cosines[across, None] > 0, agreement[across], agreement[across, ::-1])
+            nats[step] = weight * turned.mean(axis=0) / (_SCORE_SCALE * (1.0 + LEAST_VISIBLE))
+    means, deviations = _spread(_interpolated(nats), _interpolated(shifts))
+    if prior is not None:
+        nats -= prior.costs(_shifted(np.asarray(se2.relative(poses[:-1], poses[1:])), weak[:-1], shifts))
+    best = nats.argmax(axis=1)
+    is_torn = (nats[steps, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
+    deviations = np.hypot(means, deviations)
+    return Slides(weak[:-1], means, deviations, is_torn, deviations > _OPEN_DEVIATION * unit, nats[steps, best], unit)
+
+
+def _shifted(steps: Floats, directions: Floats, shifts: Floats) -> Floats:
+    """Returns the steps (k, s, 3) after shifts (s,) along directions (k, 2)."""
+    places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
+    places[..., :2] += shifts[:, None] * directions[:, None]
+    return places
 
 
 def slid_steps(scans: PlanarScans, poses: Floats) -> Slides:
