@@ -1,4 +1,4 @@
-"""Counts answers that are sure and wrong on made scans: reliefs, shells, sizes, turns, tunnels, passages and silence.
+"""Counts sure but wrong answers on made scans: reliefs, shells, sizes, turns, tunnels, passages, silence and clocks.
 
     python -m experiments.made_cases --draws 20                       20 draws of each kind
     python -m experiments.made_cases --kinds relief scale --draws 200
@@ -11,9 +11,11 @@ below an ATE of 0.05 m, a pair within 2 m and 5 degrees, a planar map where no s
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -24,12 +26,13 @@ from tyro.conf import arg
 
 from dpmjax import cli, deepmapping, deeppointmap, io, metrics, sequences, simulation, slam, weights
 from dpmjax.geometry import rigid, se2
+from tests.io.bag_files import BagWriter
 
 NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M, RIGHT_PASSAGE_M = 25, 0.12, 0.006, 0.9, 0.05, 0.5
 FUSED = ("fused", "fused-cut")
-PX_M, CROP_M = 0.05, 35.0
-# The map is that of the alignment: a fit takes longer, and the trust is the same.
-FEW_STEPS = deepmapping.with_steps(deepmapping.preset("fast"), 2)
+PX_M, CROP_M, ANGLES = 0.05, 35.0, np.linspace(-np.pi / 2, np.pi / 2, 181)
+# The map is that of the alignment: a fit compiles for each number of scans, and the trust is the same.
+NO_FIT = slam.RegistrationHooks(engine=lambda _rows: partial(deepmapping.fit, stop=lambda: True))
 COLUMNS = ("sure_and_wrong", "right_and_sure", "is_sure", "is_right", "error_m", "seconds")
 
 
@@ -39,7 +42,9 @@ class MadeOptions(cli.RunOptions, cli.ModelOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset({"draws", "kinds"})
 
-    kinds: tuple[str, ...] = ("relief", "shell", "scale", "turn", "tunnel", "passage", "wheels", "silence")
+    kinds: tuple[str, ...] = (
+        "relief", "shell", "scale", "turn", "tunnel", "passage", "wheels", "silence", "clock", "late",
+    )  # fmt: skip
     """Kinds of cases."""
     draws: Annotated[int, cli.Bound(1)] = 5
     """Draws of each kind."""
@@ -122,15 +127,14 @@ def map_gallery(model: deeppointmap.Model, rng: np.random.Generator) -> Answer:
     return Answer(error_m, error_m < RIGHT_ATE_M, result.assessment.is_trusted)
 
 
-def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
-    """Maps a planar drive from a room through a passage to another room; right within half a metre.
+def draw_passage(rng: np.random.Generator) -> tuple[np.ndarray, sequences.FloatArray, sequences.FloatArray]:
+    """Draws a planar drive from a room through a passage to another room.
 
     Args:
         rng: source of all sizes: a passage 1 to 3 m wide and 12 to 30 m long, steps of 0.25 to 0.9 m.
-        odometry: "none", "wheels", or "silent" for wheels that repeat their pose for 5 to 40 scans.
 
     Returns:
-        The answer, with the worst error of a position after the best rigid alignment.
+        Ranges (n, 181) of beams from -90 to 90 degrees, poses (n, 3), and steps (n - 1, 3) by wheels.
     """
     width, length, rooms, step = rng.uniform(1, 3), rng.uniform(12, 30), rng.uniform(4, 8, 4), rng.uniform(0.25, 0.9)
     grid, middle = np.ones((200, 1000), bool), 100
@@ -144,25 +148,84 @@ def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
     x = np.arange(1.0 + rooms[0] / 2, 1.0 + rooms[0] + length + rooms[1] / 2, step)
     y = middle * PX_M + 0.1 * width * np.sin(x / rng.uniform(2, 5))
     poses = np.column_stack([x, y, np.arctan2(np.gradient(y), np.gradient(x)) + rng.normal(0, 0.02, len(x))])
-    angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
-    origins = np.repeat(poses[:, :2], len(angles), axis=0) / PX_M
-    ranges = PX_M * simulation.cast_rays(grid, origins, (poses[:, 2:] + angles).ravel()).reshape(len(poses), -1)
+    origins = np.repeat(poses[:, :2], len(ANGLES), axis=0) / PX_M
+    ranges = PX_M * simulation.cast_rays(grid, origins, (poses[:, 2:] + ANGLES).ravel()).reshape(len(poses), -1)
     ranges += rng.normal(0, 0.01, ranges.shape)
     steps = se2.relative(poses[:-1], poses[1:]) + rng.normal(size=(len(x) - 1, 3)) * [0.03 * step, 0.03 * step, 0.01]
+    return ranges, poses, steps
+
+
+def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
+    """Maps a drive of `draw_passage`; right within half a metre.
+
+    Args:
+        rng: source of the drive.
+        odometry: "none", "wheels", or "silent" for wheels that repeat their pose for 5 to 40 scans. "clock" and "late"
+            are recorded with wheels (`record_passage`).
+
+    Returns:
+        The answer, with the worst error of a position after the best rigid alignment.
+    """
+    ranges, poses, steps = draw_passage(rng)
     if odometry == "silent":
         count = int(rng.integers(5, min(40, len(steps) // 2)))
         begin = int(rng.integers(1, len(steps) - count))
         steps[begin : begin + count] = 0.0
-    points = (ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).astype(np.float32)
-    found = slam.register_scans(
-        points,
-        slam.RegistrationConfig(fit=FEW_STEPS, min_distance=0.1),
-        key=jax.random.key(0),
-        odometry=None if odometry == "none" else se2.chain(steps),
-    )
-    drive = sequences.ScanSequence("passage", points, np.ones(points.shape[:2], bool), "m", reference_poses=poses)
+    points = (ranges[..., None] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)).astype(np.float32)
+    wheels = None if odometry == "none" else se2.chain(steps)
+    drive = sequences.ScanSequence("passage", points, np.ones(points.shape[:2], bool), "m", poses, wheels)
+    if odometry in ("clock", "late"):
+        with tempfile.TemporaryDirectory() as folder:
+            recorded = io.read_sequence(record_passage(rng, Path(folder), ranges, se2.chain(steps), fault=odometry))
+        drive = replace(recorded, reference_poses=poses)
+    config, key = slam.RegistrationConfig(min_distance=0.1), jax.random.key(0)
+    found = slam.register_scans(drive, config, key=key, odometry=drive.odometry_poses, hooks=NO_FIT)
     worst_m = metrics.planar_errors(drive, found.poses)["worst_scan_m"]
     return Answer(worst_m, worst_m < RIGHT_PASSAGE_M, found.assessment.is_trusted)
+
+
+def record_passage(
+    rng: np.random.Generator, folder: Path, ranges: np.ndarray, odometry: sequences.FloatArray, *, fault: str
+) -> Path:
+    """Records a drive in a bag of ROS 1 or 2, or in a CARMEN log, with wrong stamps.
+
+    Args:
+        rng: source of the rate, 1 to 10 Hz, of the format and of the fault.
+        folder: of the file.
+        ranges: (n, 181).
+        odometry: (n, 3).
+        fault: "clock": stamps of the scans, the odometry or both step back by 1 to 20 s at a scan, in a log of both.
+            "late": stamps of the odometry are 0.3 to 5 s late; a bag.
+
+    Returns:
+        The file.
+    """
+    period, kind, back = rng.uniform(0.1, 1.0), str(rng.choice(["bag", "db3", "log"])), np.zeros((2, len(ranges)))
+    if fault == "clock":
+        who = slice(None) if kind == "log" else ((0,), (1,), (0, 1))[rng.integers(3)]
+        back[who, int(rng.integers(1, len(ranges))) :] = rng.uniform(1, 20)
+    else:
+        back[1], kind = -rng.uniform(0.3, 5.0), kind.replace("log", "bag")
+    recorded = 1.6e9 + period * np.arange(len(ranges))
+    stamps = recorded - back
+    if kind == "log":
+        path = folder / "drive.log"
+        lines = zip(ranges, odometry, stamps[0], strict=True)
+        path.write_text("".join(
+            "ODOM {1} {2} {3} 0 0 0 {0} host {0}\nFLASER 181 {4} {1} {2} {3} {1} {2} {3} {0} host {0}\n".format(
+                stamp, *pose, " ".join(map(str, row))
+            )
+            for row, pose, stamp in lines
+        ))  # fmt: skip
+        return path
+    with BagWriter(folder / "drive", kind) as bag:
+        whole = np.full((len(ranges), 360), np.inf)
+        whole[:, 90:271] = ranges
+        for row, pose, now, (scan, wheel) in zip(whole, odometry, recorded, stamps.T, strict=True):
+            ns = [int(1e9 * time) for time in (now, scan, wheel)]
+            bag.write_odometry(pose, ns[2], delay_ns=ns[0] - ns[2])
+            bag.write_scan(row, ns[1], delay_ns=ns[0] - ns[1])
+    return bag.path
 
 
 class Pair(NamedTuple):
@@ -256,6 +319,8 @@ KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = 
     "passage": lambda _, rng: map_passage(rng, odometry="none"),
     "wheels": lambda _, rng: map_passage(rng, odometry="wheels"),
     "silence": lambda _, rng: map_passage(rng, odometry="silent"),
+    "clock": lambda _, rng: map_passage(rng, odometry="clock"),
+    "late": lambda _, rng: map_passage(rng, odometry="late"),
 }
 
 

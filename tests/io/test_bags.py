@@ -135,6 +135,29 @@ def test_a_clock_that_was_set_back_leaves_the_order_of_the_recording(tmp_path: P
         assert notes[0].is_doubt
 
 
+@pytest.mark.parametrize("who", ["scan", "odometry", "scan and odometry"])
+@pytest.mark.parametrize("back_ns", [STEP_NS + STEP_NS // 4, 20 * STEP_NS])
+def test_any_clock_that_was_set_back_leaves_the_order_of_the_recording(tmp_path: Path, who: str, back_ns: int) -> None:
+    """Also by little more than a step, and that of the wheels alone; a scan that was overtaken is no fault."""
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        for index in range(20):
+            now, back = EPOCH_NS + STEP_NS * index, back_ns if index >= 8 else 0
+            stamps = [now - back if each in who else now for each in ("scan", "odometry")]
+            bag.write_scan(np.linspace(2.0, 3.0, 40) + 0.1 * index, stamps[0], delay_ns=now - stamps[0])
+            bag.write_odometry(np.array([0.1 * index, 0.0, 0.0]), stamps[1], delay_ns=now - stamps[1])
+    scans = read_sequence(bag.path)
+    np.testing.assert_allclose(np.linalg.norm(scans.points[:, 0], axis=1), 2.0 + 0.1 * np.arange(20), atol=1e-5)
+    np.testing.assert_allclose(scans.odometry_poses[:, 0], 0.1 * np.arange(20), atol=1e-6)
+    assert [note.text.count("step back") for note in scans.notes] == [1, 0]
+    with BagWriter(tmp_path / "b", "bag") as bag:
+        for index in range(20):
+            delay = STEP_NS * 3 // 2 if index == 8 else 0
+            bag.write_scan(np.linspace(2.0, 3.0, 40) + 0.1 * index, EPOCH_NS + STEP_NS * index, delay_ns=delay)
+    scans = read_sequence(bag.path)
+    np.testing.assert_allclose(np.linalg.norm(scans.points[:, 0], axis=1), 2.0 + 0.1 * np.arange(20), atol=1e-5)
+    assert not scans.notes
+
+
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_poses_beside_a_bag_are_used_where_they_have_its_times(tmp_path: Path, kind: str, clouds) -> None:
     path = write_clouds(tmp_path / "a", kind, clouds)

@@ -9,7 +9,7 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.scan import planar_scans
-from dpmjax.simulation import simulate_sequence
+from dpmjax.simulation import make_world, scan_world, simulate_sequence
 from dpmjax.slam.planar.recordings import (
     Recording,
     align_between,
@@ -145,6 +145,20 @@ def test_scans_that_follow_a_silent_odometry_are_named() -> None:
     assert set(np.flatnonzero(off > 20)) <= set(lost)
     honest = recording._replace(motion=true)
     assert not len(honest.aligned(true[rows])[1])
+
+
+@pytest.mark.slow
+def test_scans_place_what_a_backward_odometry_places_wrongly() -> None:
+    """Wheels that count forward alone, while the robot drives back from scan 40 to 80."""
+    walk = simulate_sequence(0, 2)
+    steps = np.tile([1.5, 0.0, 0.01], (120, 1))
+    steps[40:80, 0] *= -1.0
+    true = np.asarray(se2.compose(walk.reference_poses[0], se2.chain(steps)))
+    points, mask = scan_world(make_world(0).is_obstacle, true, num_beams=256)
+    odometry, rows = se2.chain(np.abs(steps)), np.array([0, 40, 80, 120])
+    poses, lost = Recording(ScanSet(points, mask), rows, odometry, np.arange(121)).aligned(true[rows])
+    assert not len(lost)
+    assert np.linalg.norm(poses[:, :2] - true[:, :2], axis=1).max() < 3.0
 
 
 def test_odometry_is_silent_where_the_robot_moves_and_not_where_it_stands() -> None:

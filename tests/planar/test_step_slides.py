@@ -8,7 +8,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.scan import PlanarScans, planar_scans
 from dpmjax.scan.planar.motion_prior import StepPrior
-from dpmjax.scan.planar.slide import slide_steps
+from dpmjax.scan.planar.slide import slide_parts, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 from dpmjax.slam import assess_trajectory, incremental_icp, refine
 from dpmjax.slam.planar.joint import restore_torn
@@ -32,7 +32,7 @@ def scans(truth) -> PlanarScans:
     return scans_of(truth)
 
 
-def scans_of(truth: np.ndarray, niches: tuple[int, ...] = ()) -> PlanarScans:
+def scans_of(truth: np.ndarray, niches: tuple[int, ...] = (), reach_px: float = REACH_PX) -> PlanarScans:
     solid = np.ones((200, 700), bool)
     solid[85:115, 20:680] = False
     for left, right in ((20, 140), (560, 680)):
@@ -41,7 +41,7 @@ def scans_of(truth: np.ndarray, niches: tuple[int, ...] = ()) -> PlanarScans:
     for left in niches:
         solid[81:85, left : left + 12] = False
     points, mask = scan_world(
-        solid, truth, max_range=REACH_PX, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
+        solid, truth, max_range=reach_px, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
     )
     return planar_scans(points * mask[..., None], mask)
 
@@ -143,6 +143,24 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
     torn = assess_trajectory(scans, torn_in_the_corridor(truth, 18.0), prior=prior)
     assert not torn.is_trusted
     assert {10, 11} <= set(torn.uncertain_scans)
+
+
+@pytest.mark.slow
+def test_the_ends_of_a_corridor_constrain_its_length(scans, truth) -> None:
+    """Few beams of each scan reach a wall across the corridor, but those of all pairs across a step agree."""
+    far = scans_of(truth, reach_px=600.0)
+    assert assess_trajectory(far, truth).is_trusted
+    parts = slide_parts(far, truth)
+    assert not parts.is_torn.any()
+    assert (parts.deviations < 0.02 * far.typical_range).all()
+    for factor in (0.9, 1.1):
+        steps = steps_of(truth)
+        steps[IN_CORRIDOR, 0] *= factor
+        found = assess_trajectory(far, se2.chain(steps))
+        assert not found.is_trusted
+        assert found.uncertain_scans
+    # Where no beam reaches an end, nothing does.
+    assert (slide_parts(scans, truth).deviations[9:13] > 0.05 * scans.typical_range).all()
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:

@@ -156,20 +156,26 @@ class _Bag:
                 seconds, nanoseconds = struct.unpack_from(f"{order}II", content, 4)
                 places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, seen[recorded_ns]))
                 seen[recorded_ns] += 1
-        notes = _fault_of_stamps(np.array([1e-9 * place.stamp_ns for place in places]), self.path)
+        stamps, recorded = 1e-9 * np.array([place[:2] for place in places], np.float64).reshape(-1, 2).T
+        notes = _fault_of_stamps(stamps, recorded, self.path)
         if notes:
             places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
         return sorted(places), notes
 
 
-def _fault_of_stamps(stamps: FloatArray, path: Path) -> tuple[Note, ...]:
+def _fault_of_stamps(stamps: FloatArray, recorded: FloatArray, path: Path) -> tuple[Note, ...]:
     """Tells why the times (n,) of headers, s, give no order; messages that overtook each other are no fault."""
-    back = np.diff(stamps, prepend=stamps[:1])
+    back, ahead = np.diff(stamps), stamps - recorded
+    # After a clock was set back, all stamps are behind the recording; a message that was overtaken is alone.
+    is_set = [
+        back[i] < -1.0 or (back[i] < 0 and np.median(ahead[i + 1 : i + 6]) - np.median(ahead[: i + 1][-5:]) < back[i])
+        for i in range(len(back))
+    ]
     if len(stamps) and stamps.min() <= 0:
         fault = "a header without a time"
-    # A stamp that steps back by more than a second comes from a clock that was set, not from messages out of order.
-    elif len(stamps) and back.min() < -1.0:
-        fault = f"the stamps step back by {-back.min():.3g} s at message {int(back.argmin())}"
+    elif any(is_set):
+        first = is_set.index(True)
+        fault = f"the stamps step back by {-back[first]:.3g} s at message {first + 1}"
     else:
         return ()
     return (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True),)
@@ -206,7 +212,9 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
             for recorded_s, message in bag.recorded(chosen)
         ]
         stamps, recorded, frames, scans = zip(*messages, strict=True)
-        notes = _fault_of_stamps(np.array(stamps), path)
+        notes = _fault_of_stamps(np.array(stamps), np.array(recorded), path)
+        for odometry_topic in bag.of_kinds(_ODOMETRY):
+            notes = notes or bag.places(odometry_topic)[1]
         times = np.array(recorded if notes else stamps)
         order = np.argsort(times, kind="stable")
         T_odom_laser, is_upside_down, found = _odometry(bag, frames[order[0]], times[order], by_recording=bool(notes))

@@ -117,6 +117,7 @@ class PlanarScans:
         typical_range: range that nine in ten beams on a line stay below, median over the scans: the unit of settings.
         is_ordered: True if neighbours in the array are neighbours in time.
         num_bearings: number of bearings of the views.
+        hits: hits that are compared with other scans; None: all valid ones.
     """
 
     points: Float[np.ndarray, "n b 2"]
@@ -128,6 +129,7 @@ class PlanarScans:
     typical_range: float
     is_ordered: bool = True
     num_bearings: int = 512
+    hits: Bool[np.ndarray, "n b"] | None = None
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -156,7 +158,7 @@ class PlanarScans:
 
     def take(self, rows: Any) -> PlanarScans:
         """Returns the scans of these rows (a slice, a list or an array), without an order in time."""
-        names = ("points", "mask", "normals", "centroids", "is_on_line")
+        names = ["points", "mask", "normals", "centroids", "is_on_line", *(["hits"] if self.hits is not None else [])]
         return replace(self, **{name: getattr(self, name)[rows] for name in names}, is_ordered=False)
 
     def lines(self, rows: Any = slice(None), stride: int = 1) -> Lines:
@@ -328,7 +330,8 @@ def make_views(scans: PlanarScans, num_bearings: int) -> Views:
     # A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
     is_seen = (gap < 2.5 * 2 * np.pi / num_beams) & (count > 1)
     slant = np.minimum(slants[row, before], slants[row, after])
-    arrays = points, scans.normals, scans.mask, surface, near, far, slant, is_seen
+    hits = scans.mask if scans.hits is None else scans.mask & scans.hits
+    arrays = points, scans.normals, hits, surface, near, far, slant, is_seen
     # The number of scans is rounded up to a power of two, at least this, so that few programs compile.
     capacity = max(64, 1 << (len(scans) - 1).bit_length())
     return Views(*(_padded(x, capacity) for x in arrays))

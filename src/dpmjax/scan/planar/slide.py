@@ -10,6 +10,7 @@ directions.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,9 @@ _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # A step is open where its standard deviation along the weak direction, by the scores alone, is above this, in typical
 # ranges.
 _OPEN_DEVIATION = 0.02
+# Least cosine between the weak direction and the normal of a surface that faces it. Pairs of scans farther apart in
+# time, of a lower score, or with less parallel weak directions, say nothing about a step between them.
+_FACING, _MOST_APART, _LEAST_SCORE, _PARALLEL = 0.5, 12, 0.1, 0.97
 # Least standard deviation of a constrained step, typical ranges and radians.
 _LEAST_DEVIATION = 0.005
 
@@ -85,12 +89,13 @@ class Slides(NamedTuple):
         return np.concatenate([steps[:, :2] + self.shifts[:, None] * self.directions, steps[:, 2:]], axis=1)
 
     def information(self) -> Floats:
-        """Returns inverse variances (k,) along the weak directions, infinite for steps that are not open.
+        """Returns inverse variances (k,) along the weak directions, infinite for steps that are not open."""
+        return np.where(self.is_open, self.above_flat(), np.inf)
 
-        The information of a uniform posterior over the reach is subtracted, so flat scores give 0.
-        """
+    def above_flat(self) -> Floats:
+        """Returns inverse variances (k,), less that of a uniform posterior over the reach: flat scores give 0."""
         flat = 3.0 / (_REACH * self.typical_range) ** 2
-        return np.where(self.is_open, np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0), np.inf)
+        return np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0)
 
     def constrained_deviations(self) -> Floats:
         """Returns the standard deviations (k,), at least that of a constrained step."""
@@ -132,17 +137,14 @@ def slide_steps(
     source, target = pairs or (np.arange(1, len(scans)), np.arange(len(scans) - 1))
     directions = weak_directions(scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
-    places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
-    places[..., :2] += shifts[:, None] * directions[:, None]
+    places = _shifted(steps, directions, shifts)
     costs = np.zeros(places.shape[:2]) if prior is None else prior.costs(places)
     scores = _slide_scores(scans, (source, target), places, costs)
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
     if prior is not None:
-        places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
-        places[..., :2] += shifts[:, None] * directions[:, None]
-        nats -= prior.costs(places)
+        nats -= prior.costs(_shifted(steps, directions, shifts))
     row, best = np.arange(len(steps)), nats.argmax(axis=1)
     is_torn = (nats[row, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
     means, deviations = _spread(nats, shifts)
@@ -197,6 +199,54 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     probability /= probability.sum(axis=1, keepdims=True)
     means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
+
+
+def slide_parts(scans: PlanarScans, poses: Floats, prior: StepPrior | None = None) -> Slides:
+    """Computes the posterior of shifts of all scans after each step against those before it, by pairs across the step.
+
+    In a passage most beams hit its sides, which fit at every shift, and a little better at short ones. So only hits on
+    surfaces across the weak direction are compared. A single pair has few of them.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) T_world_scan.
+        prior: of the n - 1 steps; None: the scores alone. It decides on torn steps only.
+
+    Returns:
+        Slides of the n - 1 steps, with mean shifts; `deviations` are those about zero, by the scores alone.
+    """
+    unit, count, steps = scans.typical_range, round(_REACH / _SPACING), np.arange(len(scans) - 1)
+    shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
+    target, apart = (x.ravel() for x in np.meshgrid(steps, np.arange(1, _MOST_APART + 1)))
+    target, source = target[target + apart < len(scans)], (target + apart)[target + apart < len(scans)]
+    relative = np.asarray(se2.relative(poses[target], poses[source]), np.float64)
+    fits = pair_scores(scans, source, target, relative) > _LEAST_SCORE
+    source, target, weak = source[fits], target[fits], weak_directions(scans)
+    facing = replace(scans, hits=np.abs(np.einsum("nbi,ni->nb", scans.normals, weak)) > _FACING)
+    agreement, _ = find_evidence(facing, source, target, _shifted(relative[fits], weak[target], shifts))
+    directions, nats = np.einsum("nij,nj->ni", se2.rotation(poses[:, 2]), weak), np.zeros((len(steps), len(shifts)))
+    for step in steps:
+        cosines = directions[target] @ directions[step]
+        across = np.flatnonzero((target <= step) & (source > step) & (np.abs(cosines) > _PARALLEL))
+        if len(across):
+            # Pairs share scans: together they count as one pair of each scan.
+            weight = len(np.unique(np.concatenate([source[across], target[across]]))) / 2
+            turned = np.where(cosines[across, None] > 0, agreement[across], agreement[across, ::-1])
+            nats[step] = weight * turned.mean(axis=0) / (_SCORE_SCALE * (1.0 + LEAST_VISIBLE))
+    means, deviations = _spread(_interpolated(nats), _interpolated(shifts))
+    if prior is not None:
+        nats -= prior.costs(_shifted(np.asarray(se2.relative(poses[:-1], poses[1:])), weak[:-1], shifts))
+    best = nats.argmax(axis=1)
+    is_torn = (nats[steps, best] - nats[:, count] > _LEAST_GAIN) & (np.abs(shifts[best]) > _LEAST_SHIFT * unit)
+    deviations = np.hypot(means, deviations)
+    return Slides(weak[:-1], means, deviations, is_torn, deviations > _OPEN_DEVIATION * unit, nats[steps, best], unit)
+
+
+def _shifted(steps: Floats, directions: Floats, shifts: Floats) -> Floats:
+    """Returns the steps (k, s, 3) after shifts (s,) along directions (k, 2)."""
+    places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
+    places[..., :2] += shifts[:, None] * directions[:, None]
+    return places
 
 
 def slid_steps(scans: PlanarScans, poses: Floats) -> Slides:

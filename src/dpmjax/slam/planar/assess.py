@@ -28,7 +28,7 @@ from dpmjax.scan.planar.compare import compare_pairs, pair_scores
 from dpmjax.scan.planar.motion_prior import StepPrior
 from dpmjax.scan.planar.propose import Hypotheses
 from dpmjax.scan.planar.record import Floats, Indices, Pairs, PlanarScans
-from dpmjax.scan.planar.slide import Slides, slid_steps, slide_steps
+from dpmjax.scan.planar.slide import Slides, slid_steps, slide_parts, slide_steps
 
 # Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
 # walls in the cells changes the code length by some percent.
@@ -280,17 +280,15 @@ def assess_trajectory(
         lost = np.convolve(is_alone, np.ones(_MAX_ALONE + 1))
         is_whole &= bool(lost.max(initial=0.0) <= _MAX_ALONE)
     steps = None if prior is None else slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
-    deviations = _deviations(scans, len(poses), pairs, steps)
-    if steps is not None:
-        later = np.arange(1, len(poses))
-        is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & ~is_alone[later] & ~is_alone[later - 1]
-        deviations[np.concatenate([later[is_torn], later[is_torn] - 1])] = np.inf
-    is_open = deviations > _MAX_DEVIATION * scans.typical_range
+    parts = slide_parts(scans, poses, prior) if scans.is_ordered else None
+    is_open = _deviations(scans, len(poses), pairs, steps, parts) > _MAX_DEVIATION * scans.typical_range
     if prior is None:
         is_open |= _turns_freely(scans)
-        if scans.is_ordered:
-            slid = slid_steps(scans, poses)
-            later = 1 + np.flatnonzero(slid.is_torn & (slid.scores > _MIN_CONNECTION))
+    if parts is not None:
+        alone = steps or slid_steps(scans, poses)
+        for is_torn in (parts.is_torn, alone.is_torn & (alone.scores > _MIN_CONNECTION)):
+            later = 1 + np.flatnonzero(is_torn)
+            later = later if prior is None else later[~is_alone[later] & ~is_alone[later - 1]]
             is_open[np.concatenate([later, later - 1])] = True
     is_open &= ~is_alone
     is_trusted = is_clear and is_whole and not is_open.any() and fault is None
@@ -314,12 +312,15 @@ def _turns_freely(scans: PlanarScans) -> Bool[np.ndarray, " n"]:
     return (left < _LEAST_TURN) & (num[:, 0, 0] > 1)
 
 
-def _deviations(scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Slides | None) -> Floats:
+def _deviations(
+    scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Slides | None, parts: Slides | None
+) -> Floats:
     """Returns the standard deviation (n,) of each scan's position relative to the largest fully constrained part.
 
     A pair is closed where its shift along the weak direction is constrained. Other pairs enter with the variance of
-    this shift. These variances, and those of the n - 1 steps with a prior, are the resistances of a network. The
-    variance of a scan is the resistance between the scan and that part, infinite where they are not connected.
+    this shift. These variances, those of the n - 1 steps with a prior, and those of all pairs across a step together
+    (`slide_parts`) are the resistances of a network. The variance of a scan is the resistance between the scan and that
+    part, infinite where they are not connected.
     """
     slides = slide_steps(scans, pairs.poses, pairs=(pairs.source, pairs.target))
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
@@ -333,9 +334,14 @@ def _deviations(scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Sl
         information = np.concatenate([information, steps.information()[rows]])
     is_closed = np.isinf(information)
     label = label_parts(num_scans, source[is_closed], target[is_closed])
+    source, target, information = source[~is_closed], target[~is_closed], information[~is_closed]
+    if parts is not None:
+        rows = np.flatnonzero(label[1:] != label[:-1])
+        source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
+        information = np.concatenate([information, parts.above_flat()[rows]])
     # A closed part moves as one.
     network = np.zeros((label.max() + 1, label.max() + 1))
-    np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
+    np.add.at(network, (label[source], label[target]), -information)
     network += network.T
     ground = np.bincount(label).argmax()
     part = label_parts(len(network), *np.nonzero(network))

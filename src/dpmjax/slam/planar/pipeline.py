@@ -213,8 +213,8 @@ def register_scans(
     if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
         report = partial(hooks.on_progress, "the map from odometry cannot be trusted: registration without it")
         report(0.0)
-        poses = incremental_icp(lines).poses
-        found[f"{START_NAMES['icp-plane']}, refined"] = refine(lines, poses, on_progress=report).poses
+        name, poses = START_NAMES["icp-plane"], incremental_icp(lines).poses
+        found |= {name: poses, f"{name}, refined": refine(lines, poses, on_progress=report).poses}
         kept, scores, assessment = _choose(run, found)
     if recording.motion is not None:
         hooks.on_progress("poses between the registered scans", 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import se2
-from dpmjax.scan.planar.align import FINE, PairPrior, match_pairs
+from dpmjax.scan.planar.align import COARSE, FINE, PairPrior, match_pairs
 from dpmjax.scan.planar.compare import WEAK_SCORE, contradicted_share, pair_scores
 from dpmjax.scan.planar.record import (
     Booleans,
@@ -80,18 +80,33 @@ class Recording(NamedTuple):
         if self.motion is None:
             return poses, np.zeros(0, np.int64)
         rows, copies = np.unique(self.originals, return_inverse=True)
-        scans = planar_scans(take_scans(self.scans, rows))
-        found = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
-        later = np.arange(1, len(rows))
-        scores = pair_scores(scans, later, later - 1, se2.relative(found[:-1], found[1:]))
-        best = np.maximum(np.append(scores, -np.inf), np.append(-np.inf, scores))
+        scans, chosen = planar_scans(take_scans(self.scans, rows)), np.searchsorted(rows, self.chosen)
+        found = align_between(scans, chosen, poses[rows])
         # So many successive scans that fit no neighbour are lost; fewer are covered, or passed by people.
-        return self._with_blind(found[copies]), rows[in_runs(best < WEAK_SCORE, 3)]
+        is_lost = in_runs(_best_scores(scans, found) < WEAK_SCORE, 3)
+        for gap in np.unique(np.searchsorted(chosen, np.flatnonzero(is_lost))):
+            # Odometry is wrong there: wheels slip, and some of them count forward alone.
+            part = np.arange(chosen[max(gap - 1, 0)], chosen[gap] + 1)
+            some, ends, turns = scans.take(part), np.array([0, len(part) - 1]), np.outer(_TURNS, [0.0, 0.0, 1.0])
+            guesses = np.broadcast_to(turns, (len(part) - 1, *turns.shape))
+            motion = se2.chain(match_pairs(some.take(slice(1, None)), some.take(slice(-1)), guesses, COARSE).poses)
+            placed = align_between(some, ends, fill_between(ends, found[part[ends]], motion))
+            if _best_scores(some, placed).sum() > _best_scores(some, found[part]).sum():
+                found[part] = placed
+        is_lost = in_runs(_best_scores(scans, found) < WEAK_SCORE, 3)
+        return self._with_blind(found[copies]), rows[is_lost]
 
     def _with_blind(self, poses: Floats) -> Floats:
         """Puts scans without any echo between their neighbours."""
         seen = np.flatnonzero(np.asarray(self.scans.mask).any(axis=1))
         return poses if len(seen) == len(poses) else interpolate(len(poses), seen, poses[seen])
+
+
+def _best_scores(scans: PlanarScans, poses: Floats) -> Floats:
+    """Computes, for each of n scans at poses (n, 3), the better one of its scores with the scans before and after."""
+    later = np.arange(1, len(poses))
+    scores = pair_scores(scans, later, later - 1, se2.relative(poses[:-1], poses[1:]))
+    return np.maximum(np.append(scores, -np.inf), np.append(-np.inf, scores))
 
 
 def in_runs(is_member: Booleans, length: int) -> Booleans:
