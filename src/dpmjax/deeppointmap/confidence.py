@@ -30,8 +30,8 @@ MAX_SCORE = 3.0
 # The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure. The share has the
 # best likelihood on places left out of the fit (by a script, on the pairs of `experiments.dpm_calibrate`).
 CORRIDOR_CONFIDENCE = 0.88
-# Niches and pillars at equal steps repeat at other places. Of 118 wrong motions of simulated corridors and tunnels none
-# has a larger `distinct_gap` than 7.5; of 91 right ones 37 have more than this limit.
+# Niches and pillars at equal steps repeat at other places. Of 148 wrong motions of simulated corridors and tunnels none
+# has a larger `distinct_gap` than 7.5; of 125 right ones 51 have more than this limit.
 CLEAR_DISTINCT_GAP = 10.0
 # Fewer elements see and meet less of each other than those of the fit.
 MIN_NUM_ELEMENTS = 512
