@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry import rigid
 from dpmjax.geometry.planes import geman_mcclure
 from dpmjax.scan.lidar.pairs import Pairs, nearest_planes
 from dpmjax.scan.lidar.surfaces import Surface
@@ -71,9 +70,9 @@ def _pair_both(source: Surface, target: Surface, T_target_source: Pose, radius_m
     T, T_inverse = np.asarray(T_target_source, np.float64), np.linalg.inv(T_target_source)
     pairs = nearest_planes(source, target, T[None], radius_m, NUM_ELEMENTS // 2).take(0)
     back = nearest_planes(target, source, T_inverse[None], radius_m, NUM_ELEMENTS // 2).take(0)
-    scale = np.cbrt(np.linalg.det(T[:3, :3]))
-    normals, residuals = back.normals @ T[:3, :3].T / scale, -scale * back.residuals
-    back = back._replace(points=rigid.transform_points(T, back.points), normals=normals, residuals=residuals)
+    turn, scale = T[:3, :3].T, np.cbrt(np.linalg.det(T[:3, :3]))
+    points, normals = back.points @ turn + T[:3, 3], back.normals @ turn / scale
+    back = back._replace(points=points, normals=normals, residuals=-scale * back.residuals)
     return Pairs(*map(np.concatenate, zip(pairs, back, strict=True)))
 
 
