@@ -80,7 +80,7 @@ def test_a_log_as_recorded_has_odometry_and_no_reference(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["twice", "set back for good", "set back for a while", "missing stamps"])
-def test_wrong_stamps_alone_change_no_odometry(tmp_path, kind):
+def test_wrong_stamps_alone_change_no_odometry(tmp_path, kind, caplog):
     turns = np.linspace(0, 3, 30)
     odometry = np.column_stack([5 * np.sin(turns), 5 - 5 * np.cos(turns), turns])
     times = 100.0 + np.arange(30)
@@ -99,6 +99,7 @@ def test_wrong_stamps_alone_change_no_odometry(tmp_path, kind):
     np.testing.assert_array_equal(log.reference_poses[:, 0], range(len(odometry)))
     assert (np.diff(log.times) >= 0).all()
     assert np.ptp(log.times) > 20
+    assert ("the clock was set back" in caplog.text) == (kind == "set back for good")
 
 
 def robotlaser(ranges, laser, robot, time, start=-np.pi / 2, step=np.pi / 2):

@@ -154,7 +154,10 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     Returns:
         The scans in the order of time.
     """
-    times, rows = _with_one_clock(np.array(sequence.times)), np.arange(len(sequence))
+    stamps, rows = np.array(sequence.times), np.arange(len(sequence))
+    times = _with_one_clock(stamps.copy())
+    if not np.array_equal(times, stamps):
+        _log.warning("%s: the clock was set back; lines stay in their order, later times are continued", path)
     ordered = _longest_ascending(times)
     late = np.setdiff1d(rows, ordered)
     if 2 * len(late) > len(times):
