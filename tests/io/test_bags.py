@@ -279,6 +279,9 @@ def test_odometry_is_interpolated_at_the_scans(tmp_path: Path) -> None:
             bag.write_scan(room(pose), stamp + STEP_NS // 2)
     scans = read_sequence(bag.path)
     np.testing.assert_allclose(scans.odometry_poses[:-1], (POSES[1:] + POSES[:-1]) / 2, atol=1e-6)
+    # The motion goes on after the last pose.
+    before, after = scans.odometry_poses[-2:]
+    np.testing.assert_allclose(se2.relative(POSES[-1], after), se2.relative(before, POSES[-1]), atol=1e-6)
 
 
 def test_beams_without_echo_and_scans_of_fewer_beams_are_masked(tmp_path: Path) -> None:

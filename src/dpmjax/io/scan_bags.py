@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry import se2
+from dpmjax.geometry import rigid, se2
 from dpmjax.io.clouds import TimedCloud, cloud_of
 from dpmjax.io.files import import_for, natural_key, refusing, to_float32
 from dpmjax.io.lidar_file import check_scan
@@ -312,8 +312,22 @@ def _odometry(
     if len(moving.times) < 2 or is_near.mean() < _LEAST_SHARE:
         text = f"{bag.path}: the {what} is not of the times of the scans; it is not used"
         return None, is_upside_down, (Note(text, is_doubt=True),)
-    T = np.asarray(interpolate_poses(moving.times, moving.T_parent_child, times) @ T_top_laser)
+    T = np.asarray(_continued(moving, times) @ T_top_laser)
     return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: {what}"),)
+
+
+def _continued(moving: _Motion, times: FloatArray) -> FloatArray:
+    """Interpolates poses; within a second before the first one and after the last one, the motion goes on.
+
+    The ends of odometry with late or early stamps are no standing: a first or last step of nearly no motion would be.
+    """
+    inside = np.clip(times, moving.times[0], moving.times[-1])
+    T, mirrored = (
+        interpolate_poses(moving.times, moving.T_parent_child, at)
+        for at in (inside, inside - np.clip(times - inside, -1.0, 1.0))
+    )
+    is_outside = (times != inside)[:, None, None]
+    return np.where(is_outside, T @ rigid.inverse(mirrored) @ T, T)
 
 
 def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
