@@ -290,6 +290,8 @@ def localize_scans(
     half = slam.take_keyframes(whole, range(max(num_early, 1)))
     path = save_map(folder / f"first_half_{precision}.npz", half, precision)
     slam_map, taken = load_map(path), [keyframe.scan for keyframe in half.keyframes]
+    # A map at int8 keeps fewer keyframes.
+    kept = [keyframe.scan for keyframe in slam_map.keyframes]
     others = np.setdiff1d(np.arange(len(drive)), taken)
     rng = np.random.default_rng(options.seed)
     chosen = np.sort(rng.choice(others, min(options.localize, len(others)), replace=False))
@@ -303,7 +305,7 @@ def localize_scans(
         is_inside = apart_m <= (3.0 if is_indoors(drive) else 10.0)
         row["num_inside"] += int(is_inside)
         if one.is_in_map:
-            error_m = localization_error(one, slam_map, T[taken], T_scan)
+            error_m = localization_error(one, slam_map, T[kept], T_scan)
             errors_m += [] if error_m is None else [error_m]
             row[f"num_{'' if is_inside else 'outside_'}{'wrong' if error_m is None else 'right'}"] += 1
     median_m = float(np.median(errors_m)) if errors_m else None
