@@ -317,10 +317,8 @@ def _odometry(
 
 
 def _continued(moving: _Motion, times: FloatArray) -> FloatArray:
-    """Interpolates poses; within a second before the first one and after the last one, the motion goes on.
-
-    The ends of odometry with late or early stamps are no standing: a first or last step of nearly no motion would be.
-    """
+    # Interpolated poses. Within a second before the first one and after the last one, the motion goes on: a robot
+    # whose odometry has late stamps does not stand there.
     inside = np.clip(times, moving.times[0], moving.times[-1])
     T, mirrored = (
         interpolate_poses(moving.times, moving.T_parent_child, at)
