@@ -17,7 +17,7 @@ reliability*.png show them. On drives of your own, `dpmjax train --stages overla
 
 With --evidence, all motions that `register` tries for pairs of simulated scenes are compared with the truth. A
 regression on `evidence_shares` predicts the right ones. The file metrics.json has the weights for
-`dpmjax.deeppointmap.EvidenceWeights`, and the shares of pairs whose right motion has the highest score.
+`dpmjax.scan.EvidenceWeights`, and the shares of pairs whose right motion has the highest score.
 """
 
 from __future__ import annotations

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import VerificationConfig, prepare_scan
+from dpmjax.deeppointmap import prepare_scan
 from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, LogisticModel
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.registration import register_each
 from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.scan import ViewCorrelationConfig
+from dpmjax.scan import VerificationConfig, ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED, ROUNDING
