@@ -30,7 +30,7 @@ from tyro.conf import arg
 from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
-from dpmjax.scan import VerificationConfig, measure_scan
+from dpmjax.scan import VerificationConfig, choose_motion, measure_scan, refine_motion
 
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
@@ -91,8 +91,8 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
     """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
     measured = measure_scan(source, config.surface), measure_scan(target, config.surface)
-    chosen = dpm.choose_motion(*measured, np.eye(4)[None], config)
-    return dpm.refine_motion(*measured, chosen, config).T_target_source
+    chosen = choose_motion(*measured, np.eye(4)[None], config)
+    return refine_motion(*measured, chosen, config).T_target_source
 
 
 def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, num_elements: int) -> np.ndarray:
