@@ -15,7 +15,7 @@ class MapAssessment(NamedTuple):
     """Trust in a map of SLAM.
 
     Attributes:
-        is_trusted: True if measured motions join all of it, and at most one scan, or a tenth of them, is uncertain.
+        is_trusted: True if measured motions join the map, and no more than a tenth of the scans, or one, are uncertain.
         uncertain_scans: numbers of the scans that were not aligned in all directions.
         num_parts: number of parts that measured motions join; the relative pose of two parts is a guess.
         fault: why there is no map; None if there is one.
