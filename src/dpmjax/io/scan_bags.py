@@ -317,13 +317,10 @@ def _odometry(
 
 
 def _continued(moving: _Motion, times: FloatArray) -> FloatArray:
-    # Interpolated poses. Within a second before the first one and after the last one, the motion goes on: a robot
-    # whose odometry has late stamps does not stand there.
+    # Interpolated poses. Before the first one and after the last one, the motion goes on: a robot whose odometry has
+    # late stamps does not stand there.
     inside = np.clip(times, moving.times[0], moving.times[-1])
-    T, mirrored = (
-        interpolate_poses(moving.times, moving.T_parent_child, at)
-        for at in (inside, inside - np.clip(times - inside, -1.0, 1.0))
-    )
+    T, mirrored = (interpolate_poses(moving.times, moving.T_parent_child, at) for at in (inside, 2 * inside - times))
     is_outside = (times != inside)[:, None, None]
     return np.where(is_outside, T @ rigid.inverse(mirrored) @ T, T)
 
